@@ -1,0 +1,228 @@
+"""Settings: one small frozen dataclass a stage, two presets, strict YAML."""
+
+from __future__ import annotations
+
+import dataclasses
+import types
+import typing
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal, TypeVar
+
+import yaml
+
+C = TypeVar("C")
+
+
+@dataclass(frozen=True)
+class EncoderConfig:
+    """Encoder Φ (METHOD 1); the defaults are the published widths."""
+
+    widths: tuple[int, ...] = (32, 32, 64, 64, 128, 256, 512)
+    code: int = 256
+    neighbours: int = 16
+    linear_blocks: int = 2  # the first blocks have no attention
+    head_channels: int = 16
+    downsample_blocks: tuple[int, ...] = (2, 4, 5)  # 0-based: thinned on entering these
+    downsample_factors: tuple[int, ...] = (2, 4, 4)
+    leak: float = 0.2
+    output_scale: float = 64000.0  # F_s and F_c are in units of this; chosen so that F_s ≈ 1 at step 0
+    points: int = 1024  # input size after farthest-point sampling
+
+
+@dataclass(frozen=True)
+class DecoderConfig:
+    """Decoder Ψ (METHOD 1), a DeepSDF network."""
+
+    hidden: int = 768
+    layers: int = 8  # hidden layers
+    skip_layer: int = 4  # 0-based: the input is concatenated before this one
+    dropout: float = 0.2  # while training
+
+
+@dataclass(frozen=True)
+class PriorConfig:
+    """The encoder-decoder. The gains bring unit-norm features to unit size per channel for the decoder."""
+
+    encoder: EncoderConfig = field(default_factory=EncoderConfig)
+    decoder: DecoderConfig = field(default_factory=DecoderConfig)
+    eqv_gain: float = 1.0
+    inv_gain: float = 1.0
+
+
+@dataclass(frozen=True)
+class MatchingConfig:
+    """Instance matching (METHOD 3)."""
+
+    score: Literal["inv", "eqv", "both"] = "both"  # Λ, 1/E, Λ ⊘ E
+    assignment: Literal["hungarian", "greedy"] = "hungarian"
+    size_weight: float = 0.0  # how much of a mismatch in metric size is held against a pair
+    max_size_ratio: float = 0.0  # 0: any
+    reject_residual: float = 0.0  # share of the object's size; registered pairs above it are not the same. 0: never
+
+
+@dataclass(frozen=True)
+class RegistrationConfig:
+    """Registration of a matched pair (METHOD 4); the defaults are the paper's."""
+
+    points: int = 1024
+    starts: Literal["embedding", "many"] = "embedding"
+    identity_start: bool = False  # also try "it did not move", for scans in one frame
+    yaw_starts: int = 0  # turns about the vertical, when upright
+    coarse_points: int = 128
+    coarse_steps: int = 12  # trimmed ICP on every start
+    keep_starts: int = 1  # how many of the starts are refined
+    steps: int = 200  # Adam on SE(3)
+    learning_rate: float = 1e-3
+    sdf_weight: float = 1.0
+    chamfer_weight: float = 1.0
+    icp_steps: int = 30
+    trim: float = 1.0  # share of nearest distances that counts
+    converged_rms: float = 0.05  # share of the object's size
+
+
+@dataclass(frozen=True)
+class JointConfig:
+    """Joint optimisation (METHOD 6); the defaults are the paper's."""
+
+    points: int = 1024
+    steps: int = 200
+    eqv_learning_rate: float = 1e-4
+    pose_learning_rate: float = 5e-5
+    inv_learning_rate: float = 1e-5
+    center_learning_rate: float = 1e-5
+
+
+@dataclass(frozen=True)
+class MeshingConfig:
+    """Mesh extraction (METHOD 5): multi-resolution iso-surface extraction, then marching cubes."""
+
+    coarse: int = 32
+    resolution: int = 64
+    half_width: float = 0.65  # of the query box, canonical units; objects are turned in it, so more than 0.55
+
+
+@dataclass(frozen=True)
+class SceneConfig:
+    """The whole method; `preset('paper')` is METHOD to the letter, `preset('robust')` the default."""
+
+    preset: str = "paper"
+    upright: bool = False
+    min_points: int = 64  # objects seen with fewer are skipped, and reported
+    static_deg: float = 1.0  # below both: static
+    static_m: float = 0.05
+    matching: MatchingConfig = field(default_factory=MatchingConfig)
+    registration: RegistrationConfig = field(default_factory=RegistrationConfig)
+    joint: JointConfig = field(default_factory=JointConfig)
+    meshing: MeshingConfig = field(default_factory=MeshingConfig)
+
+
+@dataclass(frozen=True)
+class TrainingConfig:
+    """Training of the prior (METHOD 2); lengths in canonical units (longest edge 0.9)."""
+
+    steps: int = 200_000
+    batch: int = 64  # shapes; two partial clouds each
+    learning_rate: float = 1e-4
+    warmup_steps: int = 200
+    clip: float = 1.0
+    ema: float = 0.999
+    queries: int = 1024  # a cloud: half uniform, half near the surface
+    raw_points: int = 2048  # before farthest-point sampling
+    max_views: int = 8
+    noise: float = 0.005
+    crop_probability: float = 0.4  # a half-space cut off, as by a truncated mask
+    ball_probability: float = 0.4  # a ball removed, as by occlusion
+    junk_probability: float = 0.3  # a fragment of another object, or of the floor, added
+    near_surface: float = 0.1  # |SDF| below it weighs 1, else 0.5
+    center_weight: float = 0.2
+    scale_weight: float = 0.01
+    contrast_weight: float = 0.05  # InfoNCE on F_inv between two partial clouds of one shape
+    contrast_temperature: float = 0.07
+    turn_weight: float = 0.5  # ‖F_eqv − F_eqv'‖² between them: same orientation in, same vectors out
+    validate_every: int = 250
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class TrainingRun:
+    """One configuration file of train/prior.py."""
+
+    model: PriorConfig = field(default_factory=PriorConfig)
+    training: TrainingConfig = field(default_factory=TrainingConfig)
+
+
+def preset(name: str, *, upright: bool = False) -> SceneConfig:
+    """Returns the settings called `paper` or `robust`."""
+    if name == "paper":
+        return SceneConfig(upright=upright)
+    if name == "robust":
+        return SceneConfig(
+            preset="robust",
+            upright=upright,
+            matching=MatchingConfig(size_weight=2.0, max_size_ratio=1.8, reject_residual=0.06),
+            registration=RegistrationConfig(
+                points=512,
+                starts="many",
+                identity_start=True,
+                yaw_starts=24 if upright else 0,
+                keep_starts=4,
+                steps=40,
+                learning_rate=0.01,
+                icp_steps=20,
+                trim=0.8,
+            ),
+            joint=JointConfig(points=256, steps=60, eqv_learning_rate=1e-3, pose_learning_rate=5e-4),
+        )
+    raise ValueError(f"preset {name!r}; needed 'paper' or 'robust'")
+
+
+def from_dict(cls: type[C], values: dict[str, Any], where: str = "") -> C:
+    """Builds dataclass `cls` from plain values; raises ValueError on keys it does not have or wrong types."""
+    if not isinstance(values, dict):
+        raise ValueError(f"{where or 'settings'}: got {values!r}, needed a mapping")
+    hints = typing.get_type_hints(cls)
+    names = {f.name for f in dataclasses.fields(cls)}  # type: ignore[arg-type]
+    if unknown := sorted(set(values) - names):
+        raise ValueError(f"{where or 'settings'}: unknown {', '.join(unknown)}; known are {', '.join(sorted(names))}")
+    built = {key: _convert(hints[key], value, f"{where}.{key}".lstrip(".")) for key, value in values.items()}
+    return cls(**built)
+
+
+def _convert(hint: Any, value: Any, where: str) -> Any:
+    if dataclasses.is_dataclass(hint):
+        return from_dict(hint, value, where)  # type: ignore[arg-type]
+    origin = typing.get_origin(hint)
+    if origin is Literal:
+        if value not in typing.get_args(hint):
+            raise ValueError(f"{where}: got {value!r}, needed one of {', '.join(map(repr, typing.get_args(hint)))}")
+        return value
+    if origin is tuple:
+        if not isinstance(value, list | tuple):
+            raise ValueError(f"{where}: got {value!r}, needed a list")
+        inner = typing.get_args(hint)[0]
+        return tuple(_convert(inner, v, f"{where}[{i}]") for i, v in enumerate(value))
+    if origin is types.UnionType:
+        return value if value is None else _convert(typing.get_args(hint)[0], value, where)
+    if hint is float and isinstance(value, int) and not isinstance(value, bool):
+        return float(value)
+    if not isinstance(value, hint) or (hint is int and isinstance(value, bool)):
+        raise ValueError(f"{where}: got {value!r}, needed {hint.__name__}")
+    return value
+
+
+def load_config(path: str | Path, cls: type[C]) -> C:
+    """Reads YAML into dataclass `cls`, strictly; missing keys keep their defaults."""
+    text = Path(path).read_text()
+    return from_dict(cls, yaml.safe_load(text) or {}, where=Path(path).name)
+
+
+def to_yaml(config: Any) -> str:
+    """The settings as YAML that `load_config` reads back."""
+    return yaml.safe_dump(_plain(dataclasses.asdict(config)), sort_keys=False)
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {k: _plain(v) for k, v in value.items()}
+    return [_plain(v) for v in value] if isinstance(value, tuple | list) else value

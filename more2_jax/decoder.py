@@ -1,0 +1,107 @@
+"""Decoder Ψ (paper §3.1): a shape code and a point to the signed distance, in canonical units."""
+
+from __future__ import annotations
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Float
+
+from more2_jax.config import DecoderConfig, PriorConfig
+from more2_jax.types import Embedding, pytree
+
+Affine = tuple[Float[Array, "4 h"], Float[Array, " h"]]
+
+
+@pytree
+class ObjectField:
+    """What the decoder needs of one object: code and point enter by a (3 + 1) → hidden affine map.
+
+    ⟨F_eqv, q⟩ W = q (F_eqv W) and F_inv W is constant, so both layers that see the input collapse.
+    """
+
+    first: Affine
+    skip: Affine
+    scale: Float[Array, ""]
+    center: Float[Array, "3"]
+
+
+class WeightNormDense(nn.Module):
+    """Dense layer with weight normalisation: kernel = gain · direction / |direction|, a column an output."""
+
+    features: int
+
+    @nn.compact
+    def __call__(self, inputs: int) -> tuple[Float[Array, "i o"], Float[Array, " o"]]:
+        direction = self.param("direction", nn.initializers.he_normal(), (inputs, self.features))
+        length = jnp.linalg.norm(direction, axis=0)
+        gain = self.param("gain", lambda _key: jnp.linalg.norm(direction, axis=0))
+        bias = self.param("bias", nn.initializers.zeros, (self.features,))
+        return direction * (gain / length), bias
+
+
+class Decoder(nn.Module):
+    """Ψ as three steps: kernels once, an affine map per object (`field`), points through it (`distance`)."""
+
+    config: PriorConfig
+
+    def setup(self) -> None:
+        d, code = self.config.decoder, self.config.encoder.code
+        self.input_width = 2 * code + 1
+        widths = [d.hidden] * d.layers
+        widths[d.skip_layer - 1] -= self.input_width  # so that the skip layer's input is `hidden` wide again
+        self.hidden = [WeightNormDense(w, name=f"layer_{i}") for i, w in enumerate(widths)]
+        self.output = nn.Dense(1, name=f"layer_{d.layers}")
+        self.dropout = nn.Dropout(d.dropout)
+
+    def kernels(self) -> list[tuple[Float[Array, "i o"], Float[Array, " o"]]]:
+        """Every hidden layer's kernel and bias, weight normalisation applied."""
+        d = self.config.decoder
+        inputs = [self.input_width] + [d.hidden] * (d.layers - 1)
+        return [dense(i if n != d.skip_layer else d.hidden) for n, (dense, i) in enumerate(zip(self.hidden, inputs))]
+
+    def field(self, embedding: Embedding) -> ObjectField:
+        """Folds one object's code into the two layers that see it."""
+        kernels, d = self.kernels(), self.config.decoder
+        first, bias = kernels[0]
+        skip, skip_bias = kernels[d.skip_layer]
+        return ObjectField(
+            first=self._fold(embedding, first, bias),
+            skip=self._fold(embedding, skip[-self.input_width :], skip_bias),
+            scale=embedding.scale,
+            center=embedding.center,
+        )
+
+    def _fold(self, e: Embedding, kernel: Float[Array, "i h"], bias: Float[Array, " h"]) -> Affine:
+        code = self.config.encoder.code
+        of_inv, of_eqv, of_length = kernel[:code], kernel[code:-1], kernel[-1:]
+        matrix = jnp.concatenate([self.config.eqv_gain * (e.eqv @ of_eqv), of_length])
+        return matrix, self.config.inv_gain * (e.inv @ of_inv) + bias
+
+    def distance(
+        self, field: ObjectField, points: Float[Array, "n 3"], train: bool = False
+    ) -> Float[Array, " n"]:
+        """Signed distance at `points` (frame of the code's `center`), canonical units, negative inside."""
+        d, kernels = self.config.decoder, self.kernels()
+        q = (points - field.center) / field.scale
+        length = jnp.sqrt(jnp.maximum(jnp.sum(q * q, axis=-1, keepdims=True), 1e-30))
+        q = jnp.concatenate([q, length], axis=-1)
+        h = self._activate(q @ field.first[0] + field.first[1], train)
+        for i in range(1, d.layers):
+            kernel, bias = kernels[i]
+            if i == d.skip_layer:
+                h = h @ kernel[: -self.input_width] + q @ field.skip[0] + field.skip[1]
+            else:
+                h = h @ kernel + bias
+            h = self._activate(h, train)
+        return jnp.tanh(self.output(h)[..., 0])
+
+    def _activate(self, h: Float[Array, "n h"], train: bool) -> Float[Array, "n h"]:
+        return self.dropout(jax.nn.relu(h), deterministic=not train)
+
+    def __call__(
+        self, embedding: Embedding, points: Float[Array, "n 3"], train: bool = False
+    ) -> Float[Array, " n"]:
+        """Signed distance of one object at `points`; canonical units: metres are the value times `scale`."""
+        return self.distance(self.field(embedding), points, train)

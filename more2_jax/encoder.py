@@ -1,0 +1,165 @@
+"""Encoder Φ (paper §3.1): a point cloud to an invariant, an equivariant, a scale and a centre code."""
+
+from __future__ import annotations
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Bool, Float, Int
+
+from more2_jax.config import EncoderConfig
+from more2_jax.types import Embedding
+from more2_jax.vn import TINY, VNLA, EdgeVNLA, channel_normalise, masked_mean, nearest_features, norm, vn_leaky_relu
+from more2_jax.vn import kernel_init
+
+Features = Float[Array, "n 3 c"]
+Edges = Float[Array, "n k 3 c"]
+
+
+def mean_over_neighbours(edges: Edges, real: Bool[Array, "n k"]) -> Features:
+    """Mean over the neighbours that are real."""
+    weight = real / jnp.maximum(real.sum(axis=-1, keepdims=True), 1)
+    return jnp.einsum("nk,nk...->n...", weight.astype(edges.dtype), edges)
+
+
+def power_of_two(x: Float[Array, ""]) -> Float[Array, ""]:
+    """The power of two next to `x`, no gradient.
+
+    Every layer is homogeneous, so dividing by it and multiplying back is exact, and a 1 cm and a 100 m object
+    pass through the same numbers.
+    """
+    _, exponent = jnp.frexp(jax.lax.stop_gradient(x))
+    return jnp.ldexp(jnp.ones((), x.dtype), jnp.clip(exponent, -60, 60))
+
+
+class FirstBlock(nn.Module):
+    """VNLA on [x̂_i × x_j, x_j − x_i, x_i], mean over neighbours: the cross product makes three channels."""
+
+    config: EncoderConfig
+
+    @nn.compact
+    def __call__(self, points: Float[Array, "n 3"], mask: Bool[Array, "n"]) -> Features:
+        index, real = nearest_features(points[..., None], points[..., None], mask, self.config.neighbours)
+        neighbour, own = points[index], jnp.broadcast_to(points[:, None], (*index.shape, 3))
+        length = jnp.sqrt(jnp.maximum(jnp.sum(points**2, axis=-1), TINY))
+        unit = (points / length[:, None])[:, None]
+        graph = jnp.stack([jnp.cross(unit, neighbour), neighbour - own, own], axis=-1)
+        return mean_over_neighbours(VNLA(self.config.widths[0], self.config.leak, name="value")(graph), real)
+
+
+class LinearBlock(nn.Module):
+    """VNLA on the graph feature, mean over neighbours."""
+
+    config: EncoderConfig
+    features: int
+
+    @nn.compact
+    def __call__(self, source: Features, mask: Bool[Array, "m"], query: Features) -> Features:
+        index, real = nearest_features(query, source, mask, self.config.neighbours)
+        edges = EdgeVNLA(self.features, self.config.leak, name="value")(source, query, index)
+        return mean_over_neighbours(edges, real)
+
+
+class AttentionBlock(nn.Module):
+    """Attention over the neighbours, then the mean over all points mixed back in (global context)."""
+
+    config: EncoderConfig
+    features: int
+
+    @nn.compact
+    def __call__(
+        self, source: Features, mask: Bool[Array, "m"], query: Features, query_mask: Bool[Array, "n"]
+    ) -> Features:
+        c = self.config
+        index, real = nearest_features(query, source, mask, c.neighbours)
+        asked = channel_normalise(VNLA(self.features, c.leak, name="query")(query))
+        key = channel_normalise(EdgeVNLA(self.features, c.leak, name="key")(source, query, index))
+        value = EdgeVNLA(self.features, c.leak, name="value")(source, query, index)
+        weight = attention_weights(asked, key, real, c.head_channels)
+        mixed = jnp.einsum("nkh,nkxhc->nxhc", weight, by_head(value, c.head_channels))
+        mixed = mixed.reshape(*mixed.shape[:-2], self.features)
+        context = jnp.broadcast_to(masked_mean(mixed, query_mask), mixed.shape)
+        return VNLA(self.features, c.leak, name="context")(jnp.concatenate([mixed, context], axis=-1))
+
+
+def by_head(x: Float[Array, "*b 3 c"], channels: int) -> Float[Array, "*b 3 heads channels"]:
+    """Splits the channels into heads."""
+    return x.reshape(*x.shape[:-1], -1, channels)
+
+
+def attention_weights(
+    query: Features, key: Edges, real: Bool[Array, "n k"], channels: int
+) -> Float[Array, "n k heads"]:
+    """Softmax over the real neighbours of ⟨Q, K⟩ / √(3·channels), a head at a time."""
+    logit = jnp.einsum("nxhc,nkxhc->nkh", by_head(query, channels), by_head(key, channels))
+    return jax.nn.softmax(logit / jnp.sqrt(3.0 * channels), axis=1, where=real[..., None])
+
+
+class Center(nn.Module):
+    """VN residual block to one vector: the centre's offset from the mean of the input."""
+
+    hidden: int
+    leak: float
+
+    @nn.compact
+    def __call__(self, x: Float[Array, "3 c"]) -> Float[Array, "3"]:
+        inner = VNLA(self.hidden, self.leak, name="inner")(x)
+        residual = inner @ self.param("residual", kernel_init, (self.hidden, 1))
+        q = residual + x @ self.param("shortcut", kernel_init, (x.shape[-1], 1))
+        return vn_leaky_relu(q, q @ self.param("direction", kernel_init, (1, 1)), self.leak)[..., 0]
+
+
+class Encoder(nn.Module):
+    """Φ for one cloud whose rows are in farthest-point order, so a prefix *is* the thinned cloud."""
+
+    config: EncoderConfig
+
+    @nn.compact
+    def __call__(self, points: Float[Array, "n 3"], mask: Bool[Array, "n"]) -> Embedding:
+        c = self.config
+        mean = masked_mean(points, mask)
+        centred = jnp.where(mask[:, None], points - mean, 0.0)
+        radius = power_of_two(jnp.sqrt(masked_mean(jnp.sum(centred**2, axis=-1), mask)))
+        features, mask = self.blocks(centred / radius, mask)
+        head = VNLA(c.code, c.leak, shared_direction=True, name="head")(features)
+        x = masked_mean(head, mask)
+        eqv = channel_normalise(x)
+        turned = x @ self.param("invariant", kernel_init, (c.code, c.code))
+        offset = Center(c.code // 2, c.leak, name="center")(x)
+        return Embedding(
+            inv=jnp.sum(channel_normalise(turned) * eqv, axis=-2),
+            eqv=eqv,
+            scale=norm(x).mean() * c.output_scale * radius,
+            center=mean + offset * c.output_scale * radius,
+            origin=jnp.zeros(3, points.dtype),
+        )
+
+    def blocks(
+        self, points: Float[Array, "n 3"], mask: Bool[Array, "n"]
+    ) -> tuple[Features, Bool[Array, "m"]]:
+        """All VN blocks; thinning takes the first rows."""
+        c = self.config
+        thinning = dict(zip(c.downsample_blocks, c.downsample_factors, strict=True))
+        features = FirstBlock(c, name="block_0")(points, mask)
+        for i, width in enumerate(c.widths[1:], start=1):
+            keep = len(features) // thinning.get(i, 1)
+            query, query_mask = features[:keep], mask[:keep]
+            if i < c.linear_blocks:
+                features = LinearBlock(c, width, name=f"block_{i}")(features, mask, query)
+            else:
+                features = AttentionBlock(c, width, name=f"block_{i}")(features, mask, query, query_mask)
+            mask = query_mask
+        return features, mask
+
+
+def neighbour_counts(config: EncoderConfig, points: int) -> list[int]:
+    """How many points every block chooses its neighbours from; each must be at least `neighbours`."""
+    thinning = dict(zip(config.downsample_blocks, config.downsample_factors, strict=True))
+    counts: list[int] = []
+    for i in range(len(config.widths)):
+        counts.append(points)
+        points //= thinning.get(i, 1)
+    return counts
+
+

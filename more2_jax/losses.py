@@ -1,0 +1,75 @@
+"""Training losses (METHOD 2), for one shape seen twice or a batch of codes."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import optax
+from jax import Array
+from jaxtyping import Float
+
+from more2_jax.config import TrainingConfig
+from more2_jax.data.sampling import TrainingSample
+from more2_jax.decoder import Decoder
+from more2_jax.prior import Prior, encode_ordered
+from more2_jax.types import Embedding
+
+
+def sdf_loss(
+    predicted: Float[Array, "*b q"], truth: Float[Array, "*b q"], near_surface: float
+) -> Float[Array, ""]:
+    """Mean of λ|error|; λ = 1 where |truth| < `near_surface`, else 0.5. Canonical units."""
+    weight = jnp.where(jnp.abs(truth) < near_surface, 1.0, 0.5)
+    return jnp.mean(weight * jnp.abs(predicted - truth))
+
+
+def contrast_loss(
+    first: Float[Array, "b c"], second: Float[Array, "b c"], temperature: float
+) -> Float[Array, ""]:
+    """InfoNCE both ways: row i of one view should be nearest in angle to row i of the other."""
+    a, b = (x / jnp.maximum(jnp.linalg.norm(x, axis=-1, keepdims=True), 1e-12) for x in (first, second))
+    logits = a @ b.T / temperature
+    labels = jnp.arange(len(a))
+    cross_entropy = optax.softmax_cross_entropy_with_integer_labels
+    return 0.5 * (cross_entropy(logits, labels).mean() + cross_entropy(logits.T, labels).mean())
+
+
+def turn_loss(eqv: Float[Array, "b 2 3 c"]) -> Float[Array, ""]:
+    """Mean of ‖F_eqv − F_eqv'‖²: both clouds have the shape's own orientation. 0 at best, 2 if unrelated."""
+    return jnp.mean(jnp.sum((eqv[:, 0] - eqv[:, 1]) ** 2, axis=(-2, -1)))
+
+
+def total_loss(
+    prior: Prior, sample: TrainingSample, config: TrainingConfig, dropout_key: Array
+) -> tuple[Float[Array, ""], dict[str, Float[Array, ""]]]:
+    """The training loss of a batch and its terms; shapes are canonical, so F_c → 0 and F_s → 1."""
+    embedding, predicted = predict(prior, sample, dropout_key, train=True)
+    terms = {
+        "sdf": sdf_loss(predicted, sample.sdf, config.near_surface),
+        "center": jnp.mean(jnp.linalg.norm(embedding.center + 1e-12, axis=-1)),
+        "scale": jnp.mean(jnp.abs(1.0 - embedding.scale)),
+        "contrast": contrast_loss(embedding.inv[:, 0], embedding.inv[:, 1], config.contrast_temperature),
+        "turn": turn_loss(embedding.eqv),
+    }
+    weights = {
+        "sdf": 1.0,
+        "center": config.center_weight,
+        "scale": config.scale_weight,
+        "contrast": config.contrast_weight,
+        "turn": config.turn_weight,
+    }
+    return sum((weights[k] * v for k, v in terms.items()), jnp.zeros(())), terms
+
+
+def predict(
+    prior: Prior, sample: TrainingSample, dropout_key: Array, train: bool
+) -> tuple[Embedding, Float[Array, "b 2 q"]]:
+    """Encodes both clouds of every shape and decodes the queries with each cloud's own code."""
+    embedding = jax.vmap(jax.vmap(lambda p, m: encode_ordered(prior, p, m)))(sample.points, sample.mask)
+    decoder, weights = Decoder(prior.config), {"params": prior.params["decoder"]}
+
+    def decode(e: Embedding, q: Float[Array, "q 3"], key: Array) -> Float[Array, " q"]:
+        return decoder.apply(weights, e, q, train, rngs={"dropout": key})  # type: ignore[return-value]
+
+    keys = jax.random.split(dropout_key, sample.sdf.shape[:2])
+    return embedding, jax.vmap(jax.vmap(decode))(embedding, sample.queries, keys)

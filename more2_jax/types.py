@@ -1,0 +1,184 @@
+"""The records that pass between stages: device records are pytrees, host records hold NumPy arrays."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import TypeVar, dataclass_transform
+
+import flax.struct
+import jaxlie
+import numpy as np
+from jax import Array
+from jaxtyping import Bool, Float, Int
+
+T = TypeVar("T")
+
+
+@dataclass_transform(frozen_default=True, kw_only_default=True)
+def pytree(cls: type[T]) -> type[T]:
+    """Makes `cls` a frozen, keyword-only dataclass that JAX maps over."""
+    decorate: Callable[[type[T]], type[T]] = flax.struct.dataclass
+    return decorate(cls, kw_only=True)  # type: ignore[call-arg]
+
+
+# --- on the device: what stages take and return -------------------------------------------------------------
+
+
+@pytree
+class PointCloud:
+    """A padded point cloud; rows where `mask` is False carry no meaning.
+
+    `points` are metres relative to `origin`, which stays float64 on the host: an object surveyed a
+    kilometre from the world's zero keeps its micrometres in float32.
+    """
+
+    points: Float[Array, "*batch n 3"]  # metres, relative to `origin`
+    mask: Bool[Array, "*batch n"]  # True where the point is real
+    origin: Float[Array | np.ndarray, "*batch 3"]  # metres, in the scan's frame
+
+
+@pytree
+class Embedding:
+    """What the encoder says of one object (paper §3.1): `Φ(sRX + t) = (inv, R·eqv, s·scale, sR·center + t)`."""
+
+    inv: Float[Array, "*batch c"]  # F_inv, no unit
+    eqv: Float[Array, "*batch 3 c"]  # F_eqv, columns turn with the object
+    scale: Float[Array, "*batch"]  # F_s, metres per canonical unit
+    center: Float[Array, "*batch 3"]  # F_c, metres, relative to `origin`
+    origin: Float[Array | np.ndarray, "*batch 3"]  # metres, in the scan's frame
+
+
+@pytree
+class Matches:
+    """An assignment of the objects of one scan to those of another (paper §3.2)."""
+
+    target_index: Int[Array, "*batch sources"]  # −1: no partner
+    score: Float[Array, "*batch sources"]  # the entry of H (or Λ) that was chosen; 0 without partner
+
+
+@pytree
+class Registration:
+    """A pose per pair, with its own loss (paper §3.3)."""
+
+    T_target_source: jaxlie.SE3  # source's local frame to target's local frame
+    loss: Float[Array, "*batch"]  # what was minimised, at this very pose
+    rms_m: Float[Array, "*batch"]  # trimmed root mean square of nearest distances, both ways
+    converged: Bool[Array, "*batch"]  # the pose stopped moving and explains both clouds
+
+
+@pytree
+class JointFit:
+    """Shape code and poses of one object, optimised together over its observations (paper §3.5)."""
+
+    embedding: Embedding  # in the frame of the reference observation
+    T_ref_obs: jaxlie.SE3  # one a observation
+    loss: Float[Array, "*batch"]
+
+
+# --- on the host: what people load, keep and write ----------------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True)
+class Mesh:
+    """A triangle mesh; metres."""
+
+    vertices: Float[np.ndarray, "v 3"]
+    faces: Int[np.ndarray, "f 3"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Instance:
+    """One object as one scan saw it; metres, in the scan's frame, float64."""
+
+    id: int
+    points: Float[np.ndarray, "n 3"]
+    label: str | None = None
+    colors: Int[np.ndarray, "n 3"] | None = None  # uint8
+
+
+@dataclass(frozen=True, kw_only=True)
+class Skipped:
+    """Something in a scan that was left out, and why."""
+
+    what: str
+    reason: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scan:
+    """One visit to the place: instances and what was ignored."""
+
+    name: str
+    source: str
+    instances: tuple[Instance, ...]
+    background: Float[np.ndarray, "b 3"] = field(default_factory=lambda: np.zeros((0, 3)))
+    skipped: tuple[Skipped, ...] = ()
+    warnings: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Observation:
+    """One object in one scan. `T_ref_scan` maps the scan's points onto the object's reference observation."""
+
+    scan: int
+    instance: int
+    T_ref_scan: Float[np.ndarray, "4 4"]  # float64, row-major
+    score: float  # of the match; 1 for the reference observation itself
+    rms_m: float
+    converged: bool
+
+
+@dataclass(frozen=True, kw_only=True)
+class SceneObject:
+    """One object of the living scene over all scans.
+
+    `points` are accumulated in the frame of the reference observation; `point_scan` names the scan each
+    came from, so every single observation can be had back: `inverse(T_ref_scan) @ points[point_scan == s]`.
+    """
+
+    id: str
+    label: str | None
+    reference_scan: int
+    observations: tuple[Observation, ...]
+    points: Float[np.ndarray, "n 3"]  # float64
+    point_scan: Int[np.ndarray, "n"]
+    embedding: Embedding  # NumPy leaves, unbatched; frame of the reference observation
+    mesh: Mesh | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Changes:
+    """What happened between two scans that follow each other; object ids."""
+
+    from_scan: int
+    to_scan: int
+    moved: tuple[str, ...] = ()
+    static: tuple[str, ...] = ()
+    added: tuple[str, ...] = ()
+    removed: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScanRecord:
+    """What a living scene remembers of a scan."""
+
+    index: int
+    name: str
+    source: str
+    instances: tuple[int, ...]
+    skipped: tuple[Skipped, ...] = ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class LivingScene:
+    """All objects over all scans, and what changed between scans."""
+
+    preset: str
+    prior: str
+    upright: bool
+    scans: tuple[ScanRecord, ...]
+    objects: tuple[SceneObject, ...]
+    changes: tuple[Changes, ...]
+    timing_s: dict[str, float] = field(default_factory=dict)
+    unit: str = "m"
