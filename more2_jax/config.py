@@ -58,7 +58,8 @@ class MatchingConfig:
     assignment: Literal["hungarian", "greedy"] = "hungarian"
     size_weight: float = 0.0  # how much of a mismatch in metric size is held against a pair
     max_size_ratio: float = 0.0  # 0: any
-    reject_residual: float = 0.0  # share of the object's size; registered pairs above it are not the same. 0: never
+    motion_weight: float = 0.0  # a metre moved costs this much score: decides among identical objects
+    reject_residual: float = 0.0  # share of the object's radius; a pair above it is not one object. 0: never
 
 
 @dataclass(frozen=True)
@@ -73,12 +74,12 @@ class RegistrationConfig:
     coarse_steps: int = 12  # trimmed ICP on every start
     keep_starts: int = 1  # how many of the starts are refined
     steps: int = 200  # Adam on SE(3)
-    learning_rate: float = 1e-3
+    learning_rate: float = 1e-3  # radians, and shares of the target's radius
     sdf_weight: float = 1.0
     chamfer_weight: float = 1.0
     icp_steps: int = 30
     trim: float = 1.0  # share of nearest distances that counts
-    converged_rms: float = 0.05  # share of the object's size
+    converged_rms: float = 0.05  # share of the target's radius
 
 
 @dataclass(frozen=True)
@@ -86,6 +87,7 @@ class JointConfig:
     """Joint optimisation (METHOD 6); the defaults are the paper's."""
 
     points: int = 1024
+    start: Literal["best", "accumulated"] = "best"  # F_0: code of the observation with the lowest L_sdf, or of all
     steps: int = 200
     eqv_learning_rate: float = 1e-4
     pose_learning_rate: float = 5e-5
@@ -111,6 +113,7 @@ class SceneConfig:
     min_points: int = 64  # objects seen with fewer are skipped, and reported
     static_deg: float = 1.0  # below both: static
     static_m: float = 0.05
+    accumulate_target: bool = False  # match and register against all seen so far, not the reference observation
     matching: MatchingConfig = field(default_factory=MatchingConfig)
     registration: RegistrationConfig = field(default_factory=RegistrationConfig)
     joint: JointConfig = field(default_factory=JointConfig)
@@ -160,7 +163,10 @@ def preset(name: str, *, upright: bool = False) -> SceneConfig:
         return SceneConfig(
             preset="robust",
             upright=upright,
-            matching=MatchingConfig(size_weight=2.0, max_size_ratio=1.8, reject_residual=0.06),
+            accumulate_target=True,
+            matching=MatchingConfig(
+                score="inv", size_weight=0.5, max_size_ratio=1.8, motion_weight=0.01, reject_residual=0.08
+            ),
             registration=RegistrationConfig(
                 points=512,
                 starts="many",
@@ -172,7 +178,7 @@ def preset(name: str, *, upright: bool = False) -> SceneConfig:
                 icp_steps=20,
                 trim=0.8,
             ),
-            joint=JointConfig(points=256, steps=60, eqv_learning_rate=1e-3, pose_learning_rate=5e-4),
+            joint=JointConfig(points=256, start="accumulated", steps=60, eqv_learning_rate=1e-3, pose_learning_rate=5e-4),
         )
     raise ValueError(f"preset {name!r}; needed 'paper' or 'robust'")
 

@@ -1,4 +1,4 @@
-"""Farthest points, nearest neighbours, Kabsch, chamfer: geometry for one cloud or one pair; vmap outside."""
+"""Farthest points, nearest neighbours, Kabsch, chamfer: for one cloud or one pair; vmap outside."""
 
 from __future__ import annotations
 
@@ -9,68 +9,179 @@ from jax import Array
 from jaxtyping import Bool, Float, Int
 
 TINY = 1e-30
+FAR = 1e12  # squared distance to a row that is not there: larger than any, yet finite
 
 
 def farthest_points(
     points: Float[Array, "n 3"], mask: Bool[Array, " n"], count: int
 ) -> tuple[Float[Array, "count 3"], Bool[Array, " count"]]:
-    """Farthest-point sampling from row 0; any prefix of the result is itself a farthest-point sample.
+    """Farthest-point sampling from the first real row; any prefix of the result is itself such a sample.
 
     Exact duplicates are taken once: rows beyond the distinct points repeat one and are masked out.
     """
-
-    def step(
-        nearest: Float[Array, " n"], chosen: Int[Array, ""]
-    ) -> tuple[Float[Array, " n"], Float[Array, ""]]:
-        offset = points - points[chosen]
-        nearest = jnp.minimum(nearest, jnp.sum(offset * offset, axis=-1))
-        return nearest, jnp.max(nearest)
+    fixed = jax.lax.stop_gradient(points)
 
     def body(carry: tuple[Array, Array], _: None) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
         nearest, chosen = carry
-        nearest, farthest = step(nearest, chosen)
-        return (nearest, jnp.argmax(nearest)), (chosen, farthest > 0)
+        offset = fixed - fixed[chosen]
+        nearest = jnp.minimum(nearest, jnp.sum(offset * offset, axis=-1))
+        return (nearest, jnp.argmax(nearest)), (chosen, jnp.max(nearest) > 0)
 
-    start = (jnp.where(mask, jnp.inf, -1.0), jnp.argmax(mask))
+    start = (jnp.where(mask, jnp.inf, -1.0).astype(points.dtype), jnp.argmax(mask))
     _, (index, more) = jax.lax.scan(body, start, length=count)
-    real = jnp.concatenate([jnp.ones(1, bool), more[:-1]]) & mask[0:1]
+    real = jnp.concatenate([jnp.any(mask)[None], more[:-1]])
     return points[index], real
 
 
-def kabsch_rotation(source: Float[Array, "n 3"], target: Float[Array, "n 3"]) -> Float[Array, "3 3"]:
-    """The rotation that best turns row i of `source` onto row i of `target`, both already centred.
+def squared_distances(a: Float[Array, "n 3"], b: Float[Array, "m 3"]) -> Float[Array, "n m"]:
+    """All squared distances, as a sum of squared differences: no cancellation, never negative."""
+    offset = [a[:, None, i] - b[None, :, i] for i in range(3)]
+    return offset[0] ** 2 + offset[1] ** 2 + offset[2] ** 2
 
-    Horn's quaternion: the eigenvector of a symmetric 4×4 matrix, never a reflection, also when the points lie
-    on a plane, a line or a point. Found by repeated squaring, so that its gradient is finite where that of an
+
+def nearest_both_ways(
+    a: Float[Array, "n 3"], a_mask: Bool[Array, " n"], b: Float[Array, "m 3"], b_mask: Bool[Array, " m"]
+) -> tuple[Int[Array, " n"], Int[Array, " m"], Float[Array, " n"], Float[Array, " m"]]:
+    """Indices of each row's nearest real row in the other cloud, and squared distances (`FAR` where masked)."""
+    squared = squared_distances(a, b)
+    ab, ba = jnp.where(b_mask, squared, FAR), jnp.where(a_mask[:, None], squared, FAR)
+    to_b, to_a = jnp.argmin(ab, axis=1), jnp.argmin(ba, axis=0)
+    d_ab, d_ba = ab.min(axis=1), ba.min(axis=0)
+    return to_b, to_a, jnp.where(a_mask, d_ab, FAR), jnp.where(b_mask, d_ba, FAR)
+
+
+def trimmed(squared: Float[Array, " n"], share: float) -> Bool[Array, " n"]:
+    """True for the smallest `share` of the real squared distances (those below `FAR`)."""
+    real = squared < FAR
+    if share >= 1.0:
+        return real
+    last = jnp.ceil(share * real.sum()).astype(int) - 1
+    return real & (squared <= jnp.sort(squared)[jnp.maximum(last, 0)])
+
+
+def two_way_rms(
+    a: Float[Array, "n 3"],
+    a_mask: Bool[Array, " n"],
+    b: Float[Array, "m 3"],
+    b_mask: Bool[Array, " m"],
+    share: float,
+) -> Float[Array, ""]:
+    """Trimmed root mean square nearest distance over both directions, metres; the worse direction counts.
+
+    The worse, not the mean: a small fragment fits snugly inside many places of a large cloud.
+    """
+    _, _, d_ab, d_ba = nearest_both_ways(a, a_mask, b, b_mask)
+    means = [jnp.where(trimmed(d, share), d, 0).sum() / jnp.maximum(trimmed(d, share).sum(), 1) for d in (d_ab, d_ba)]
+    return jnp.sqrt(jnp.maximum(means[0], means[1]))
+
+
+def chamfer_distance(
+    a: Float[Array, "n 3"], a_mask: Bool[Array, " n"], b: Float[Array, "m 3"], b_mask: Bool[Array, " m"]
+) -> Float[Array, ""]:
+    """Mean nearest distance a → b plus mean nearest distance b → a, metres; gradient 0 at coincidence."""
+    _, _, d_ab, d_ba = nearest_both_ways(a, a_mask, b, b_mask)
+    return _masked_root_mean(d_ab, a_mask) + _masked_root_mean(d_ba, b_mask)
+
+
+def _masked_root_mean(squared: Float[Array, " n"], mask: Bool[Array, " n"]) -> Float[Array, ""]:
+    length = jnp.sqrt(jnp.where(mask, jnp.maximum(squared, TINY), 1.0))
+    return jnp.where(mask, length, 0.0).sum() / jnp.maximum(mask.sum(), 1)
+
+
+def kabsch(
+    source: Float[Array, "n 3"], target: Float[Array, "n 3"], weight: Float[Array, " n"]
+) -> jaxlie.SE3:
+    """The `T_target_source` that best maps `source[i]` onto `target[i]`, weights ≥ 0 (paper §3.3).
+
+    All weights 0 gives the identity rotation and no translation.
+    """
+    weight = weight / jnp.maximum(weight.sum(), TINY)
+    source_mean, target_mean = weight @ source, weight @ target
+    rotation = kabsch_rotation(source - source_mean, target - target_mean, weight)
+    return jaxlie.SE3.from_rotation_and_translation(rotation, target_mean - rotation @ source_mean)
+
+
+def kabsch_rotation(
+    source: Float[Array, "n 3"], target: Float[Array, "n 3"], weight: Float[Array, " n"] | None = None
+) -> jaxlie.SO3:
+    """The rotation that best turns `source[i]` onto `target[i]`, about the origin.
+
+    Horn's quaternion: the top eigenvector of a symmetric 4×4 matrix. It is never a reflection, also when the
+    points lie on a plane, a line or a point, and by repeated squaring its gradient is finite where that of an
     SVD is not (equal singular values).
     """
-    covariance = jnp.matmul(source.T, target, precision="highest")
-    return quaternion_matrix(dominant_eigenvector(horn_matrix(covariance)))
+    weighted = source if weight is None else weight[:, None] * source
+    return jaxlie.SO3(dominant_eigenvector(horn_matrix(jnp.matmul(weighted.T, target, precision="highest"))))
 
 
 def horn_matrix(h: Float[Array, "3 3"]) -> Float[Array, "4 4"]:
     """Horn's symmetric matrix of a covariance Σ sᵢ tᵢᵀ; its top eigenvector is the quaternion (w, x, y, z)."""
     trace = jnp.trace(h)
     vector = jnp.stack([h[1, 2] - h[2, 1], h[2, 0] - h[0, 2], h[0, 1] - h[1, 0]])
-    block = h + h.T - trace * jnp.eye(3)
+    block = h + h.T - trace * jnp.eye(3, dtype=h.dtype)
     return jnp.block([[trace[None, None], vector[None]], [vector[:, None], block]])
 
 
-def quaternion_matrix(q: Float[Array, "4"]) -> Float[Array, "3 3"]:
-    """Rotation matrix of a unit quaternion (w, x, y, z)."""
-    return jaxlie.SO3(q).as_matrix()
-
-
 def dominant_eigenvector(matrix: Float[Array, "4 4"]) -> Float[Array, "4"]:
-    """Unit eigenvector of the largest eigenvalue of a symmetric matrix, with finite gradients everywhere.
+    """Unit eigenvector of the largest eigenvalue of a symmetric matrix; its gradient is finite everywhere.
 
-    A zero matrix (no evidence at all) gives (1, 0, 0, 0), the identity rotation.
+    Where the largest eigenvalue is repeated, some unit vector of its space; of a zero matrix, (1, 0, 0, 0).
     """
     size = jnp.sqrt(jnp.sum(matrix * matrix) + TINY)
-    power = matrix / size + jnp.eye(4)  # eigenvalues in [0, 2]: the largest becomes the dominant one
-    for _ in range(24):
-        power = power @ power
+    power = matrix / size + jnp.eye(4, dtype=matrix.dtype)  # eigenvalues in [0, 2]: the largest dominates
+    for _ in range(20):
+        power = jnp.matmul(power, power, precision="highest")
         power = power / jnp.trace(power)
-    # Any column is the eigenvector times a component of it; the longest is the safest.
+    # Every column is the eigenvector times one of its components; the longest is the safest.
     column = power[:, jnp.argmax(jnp.diagonal(power))]
     return column / jnp.sqrt(jnp.sum(column * column) + TINY)
+
+
+def principal_axes(points: Float[Array, "n 3"], mask: Bool[Array, " n"]) -> Float[Array, "3 3"]:
+    """Right-handed principal axes of a cloud as columns, longest first."""
+    weight = mask / jnp.maximum(mask.sum(), 1)
+    centred = points - weight @ points
+    _, axes = jnp.linalg.eigh(jnp.matmul((weight[:, None] * centred).T, centred, precision="highest"))
+    axes = axes[:, ::-1]
+    return axes.at[:, 2].multiply(jnp.linalg.det(axes))
+
+
+def cloud_radius(points: Float[Array, "n 3"], mask: Bool[Array, " n"]) -> Float[Array, ""]:
+    """Largest distance from the mean, metres; at least 1e-6, so that a single point can be divided by it."""
+    weight = mask / jnp.maximum(mask.sum(), 1)
+    squared = jnp.sum((points - weight @ points) ** 2, axis=-1)
+    return jnp.sqrt(jnp.maximum(jnp.where(mask, squared, 0.0).max(), 1e-12))
+
+
+def icp_step(
+    T: jaxlie.SE3,
+    source: Float[Array, "n 3"],
+    source_mask: Bool[Array, " n"],
+    target: Float[Array, "m 3"],
+    target_mask: Bool[Array, " m"],
+    share: float,
+) -> jaxlie.SE3:
+    """One step of trimmed point-to-point ICP with correspondences both ways; returns the new `T_target_source`."""
+    moved = T @ source
+    to_b, to_a, d_ab, d_ba = nearest_both_ways(moved, source_mask, target, target_mask)
+    a = jnp.concatenate([moved, moved[to_a]])
+    b = jnp.concatenate([target[to_b], target])
+    weight = jnp.concatenate([trimmed(d_ab, share), trimmed(d_ba, share)]).astype(moved.dtype)
+    return kabsch(a, b, weight) @ T
+
+
+def icp(
+    T: jaxlie.SE3,
+    source: Float[Array, "n 3"],
+    source_mask: Bool[Array, " n"],
+    target: Float[Array, "m 3"],
+    target_mask: Bool[Array, " m"],
+    share: float,
+    steps: int,
+) -> jaxlie.SE3:
+    """`steps` of `icp_step` from `T`; differentiable, the correspondences held."""
+
+    def body(T: jaxlie.SE3, _: None) -> tuple[jaxlie.SE3, None]:
+        return icp_step(T, source, source_mask, target, target_mask, share), None
+
+    return jax.lax.scan(body, T, length=steps)[0]

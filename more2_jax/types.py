@@ -49,6 +49,16 @@ class Embedding:
     origin: Float[Array | np.ndarray, "*batch 3"]  # metres, in the scan's frame
 
 
+def scale_embedding(e: Embedding, factor: Float[Array, ""]) -> Embedding:
+    """The embedding of the same object in other units of length."""
+    return e.replace(scale=e.scale * factor, center=e.center * factor)  # type: ignore[attr-defined]
+
+
+def move_embedding(e: Embedding, T_b_a: jaxlie.SE3) -> Embedding:
+    """The embedding of a moved object: Φ is equivariant, so nothing is encoded again. One object; local frames."""
+    return e.replace(eqv=T_b_a.rotation().as_matrix() @ e.eqv, center=T_b_a @ e.center)  # type: ignore[attr-defined]
+
+
 @pytree
 class Matches:
     """An assignment of the objects of one scan to those of another (paper §3.2)."""

@@ -81,7 +81,8 @@ def optimiser(config: TrainingConfig) -> optax.GradientTransformation:
     """Adam with warm-up, cosine decay to 1 % and clipped gradients."""
     peak, warmup = config.learning_rate, config.warmup_steps
     rate = optax.warmup_cosine_decay_schedule(0.0, peak, warmup, config.steps, 0.01 * peak)
-    return optax.chain(optax.clip_by_global_norm(config.clip), optax.adam(rate))
+    adam = optax.chain(optax.clip_by_global_norm(config.clip), optax.adam(rate))
+    return optax.apply_if_finite(adam, max_consecutive_errors=20)
 
 
 def initial_state(prior: Prior, config: TrainingConfig) -> TrainingState:

@@ -48,7 +48,7 @@ def _sample_scores(prior: Prior, sample: TrainingSample) -> dict[str, Array]:
     inv = embedding.inv / jnp.linalg.norm(embedding.inv, axis=-1, keepdims=True)
     inv = inv.reshape(-1, GROUP, *inv.shape[1:])
     cosine = jnp.einsum("gic,gjc->gij", inv[:, :, 0], inv[:, :, 1])
-    rotation = jax.vmap(lambda e: kabsch_rotation(e[0].T, e[1].T))(embedding.eqv)
+    rotation = jax.vmap(lambda e: kabsch_rotation(e[0].T, e[1].T).as_matrix())(embedding.eqv)
     trace = jnp.trace(rotation, axis1=-2, axis2=-1)
     angle_deg = jnp.rad2deg(jnp.arccos(jnp.clip((trace - 1) / 2, -1, 1)))
     return {

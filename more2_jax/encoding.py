@@ -1,0 +1,57 @@
+"""Clouds of a scene to embeddings and back: padded batches in, one embedding per object out (host arrays)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float
+
+from more2_jax.batching import bucket, pad_batch, pad_clouds
+from more2_jax.geometry import farthest_points
+from more2_jax.prior import Prior, encode
+from more2_jax.types import Embedding, PointCloud
+
+WORKING_POINTS = 1024  # what the stages see of an object: a farthest-point sample, in that order
+SMALLEST_BATCH = 8  # scenes of up to so many objects share their compiled programs
+
+_thin = jax.jit(jax.vmap(lambda points, mask: farthest_points(points, mask, WORKING_POINTS)))
+
+
+def padded(clouds: Sequence[Float[np.ndarray, "n 3"]], smallest: int = SMALLEST_BATCH) -> PointCloud:
+    """Ragged clouds as one batch of fixed shape: (bucket, `WORKING_POINTS`, 3). The fillers repeat the first."""
+    cloud = pad_clouds(clouds)
+    cloud = pad_batch(cloud, bucket(len(clouds), smallest))
+    points, mask = _thin(cloud.points, cloud.mask)
+    return PointCloud(points=points, mask=mask, origin=cloud.origin)
+
+
+def embed(prior: Prior, clouds: Sequence[Float[np.ndarray, "n 3"]]) -> list[Embedding]:
+    """One embedding per cloud, in one call."""
+    return unstack(encode(prior, padded(clouds)), len(clouds))
+
+
+def unstack(batch: Embedding, count: int) -> list[Embedding]:
+    """The first `count` embeddings of a batch, as host arrays."""
+    host = jax.device_get(batch)
+    return [jax.tree.map(lambda x: np.asarray(x[k]), host) for k in range(count)]
+
+
+def stack(embeddings: Sequence[Embedding], smallest: int = SMALLEST_BATCH) -> tuple[Embedding, Bool[np.ndarray, " b"]]:
+    """A batch of fixed size and which of its rows are real; the fillers repeat the first."""
+    count = bucket(len(embeddings), smallest)
+    rows = [*embeddings, *[embeddings[0]] * (count - len(embeddings))]
+    return jax.tree.map(lambda *x: np.stack(x), *rows), np.arange(count) < len(embeddings)
+
+
+def with_origin(e: Embedding, origin: Float[np.ndarray, "*b 3"]) -> Embedding:
+    """The same embedding, its centre relative to another origin; the difference is taken in float64."""
+    center = np.asarray(e.center, np.float64) + np.asarray(e.origin) - origin
+    return e.replace(center=jnp.asarray(center, jnp.float32), origin=np.asarray(origin))  # type: ignore[attr-defined]
+
+
+def at_zero(e: Embedding) -> Embedding:
+    """The embedding with its local frame for a frame: what traced code takes."""
+    return e.replace(origin=jnp.zeros_like(e.center))  # type: ignore[attr-defined]

@@ -1,0 +1,92 @@
+"""Joint optimisation of a scene's objects (paper §3.5): records to one padded batch, and back."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+
+from more2_jax.batching import bucket
+from more2_jax.config import SceneConfig
+from more2_jax.encoding import SMALLEST_BATCH, at_zero, embed, padded, stack, unstack, with_origin
+from more2_jax.joint import Observations, fit_jointly
+from more2_jax.objects import Pose, apply_pose, points_of
+from more2_jax.prior import Prior, encode
+from more2_jax.registration import world_pose
+from more2_jax.types import SceneObject
+
+
+def embed_accumulated(prior: Prior, objects: Sequence[SceneObject], chosen: Sequence[int]) -> list[SceneObject]:
+    """Encodes the accumulated clouds of the `chosen` objects; the others stay as they are."""
+    result = list(objects)
+    if chosen:
+        for k, embedding in zip(chosen, embed(prior, [objects[k].points for k in chosen]), strict=True):
+            result[k] = dataclasses.replace(objects[k], embedding=embedding)
+    return result
+
+
+def fit_objects(
+    prior: Prior, objects: Sequence[SceneObject], chosen: Sequence[int], config: SceneConfig
+) -> list[SceneObject]:
+    """Optimises code and poses of the `chosen` objects over all their observations, in one call."""
+    result = list(objects)
+    if not chosen:
+        return result
+    seen, origins = gather(prior, [objects[k] for k in chosen], config)
+    fit = jax.device_get(fit_jointly(prior, seen, config.joint))
+    embeddings = unstack(fit.embedding, len(chosen))
+    for n, k in enumerate(chosen):
+        local = [jax.tree.map(lambda x, n=n, j=j: x[n, j], fit.T_ref_obs) for j in range(len(objects[k].observations))]
+        poses = [world_pose(T, origins[n, 0], origins[n, j]) for j, T in enumerate(local)]
+        embedding = embeddings[n].replace(origin=origins[n, 0])  # type: ignore[attr-defined]
+        result[k] = dataclasses.replace(repose(objects[k], poses), embedding=embedding)
+    return result
+
+
+def gather(
+    prior: Prior, objects: Sequence[SceneObject], config: SceneConfig
+) -> tuple[Observations, np.ndarray]:
+    """Every observation of every object as one batch (objects, observations, …), and their float64 origins."""
+    most = bucket(max(len(o.observations) for o in objects), 2)
+    count = bucket(len(objects), SMALLEST_BATCH)
+    rows = [[points_of(o, seen) for seen in o.observations] for o in objects]
+    flat = [cloud for row in rows for cloud in [*row, *[row[0]] * (most - len(row))]]
+    cloud = padded(flat, smallest=SMALLEST_BATCH * most)
+    codes = encode(prior, cloud)
+    origins = np.asarray(cloud.origin).reshape(-1, most, 3)[:count]
+    accumulated, _ = stack([o.embedding for o in objects])
+    real, poses = np.zeros((count, most), bool), np.tile([1.0, 0, 0, 0, 0, 0, 0], (count, most, 1))
+    real[:, 0] = True
+    for n, o in enumerate(objects):
+        for j, seen in enumerate(o.observations):
+            real[n, j], poses[n, j] = True, local_pose(seen.T_ref_scan, origins[n, 0], origins[n, j])
+    split = lambda x: jnp.asarray(x).reshape(-1, most, *x.shape[1:])[:count]  # noqa: E731
+    return Observations(
+        points=split(cloud.points),
+        mask=split(cloud.mask),
+        real=jnp.asarray(real),
+        codes=jax.tree.map(split, at_zero(codes)),
+        T_ref_obs=jaxlie.SE3(jnp.asarray(poses, jnp.float32)),
+        accumulated=at_zero(with_origin(accumulated, origins[:, 0])),
+    ), origins
+
+
+def local_pose(T_ref_scan: Pose, ref_origin: np.ndarray, scan_origin: np.ndarray) -> np.ndarray:
+    """The pose between local frames, as jaxlie's (qw, qx, qy, qz, x, y, z)."""
+    T = T_ref_scan.copy()
+    T[:3, 3] = apply_pose(T_ref_scan, scan_origin[None])[0] - ref_origin
+    return np.asarray(jaxlie.SE3.from_matrix(jnp.asarray(T, jnp.float32)).wxyz_xyz)
+
+
+def repose(o: SceneObject, poses: Sequence[Pose]) -> SceneObject:
+    """The object with other poses; its accumulated cloud follows."""
+    points = o.points.copy()
+    observations = []
+    for seen, T in zip(o.observations, poses, strict=True):
+        points[o.point_scan == seen.scan] = apply_pose(T, points_of(o, seen))
+        observations.append(dataclasses.replace(seen, T_ref_scan=T))
+    return dataclasses.replace(o, points=points, observations=tuple(observations))

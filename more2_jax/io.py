@@ -1,0 +1,257 @@
+"""The living-scene folder (schema version 1): written whole or not at all, read back as it was.
+
+A save fills `.NAME.new` beside the folder `NAME`, renames `NAME` to `.NAME.old`, `.NAME.new` to `NAME`, and
+removes `.NAME.old`. A process killed between the two renames leaves no `NAME` but a whole `.NAME.old`: every
+reader here then reads that, and the next save first renames it back. Killed at any other moment, `NAME` is
+the old folder or the new one, and the next save clears what lies beside it.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from more2_jax.config import SceneConfig, load_config, to_yaml
+from more2_jax.meshfile import read_mesh, read_points, write_mesh, write_points
+from more2_jax.report import write_report
+from more2_jax.types import (
+    Changes,
+    Embedding,
+    LivingScene,
+    Observation,
+    ScanRecord,
+    SceneObject,
+    Skipped,
+)
+
+VERSION = 1
+STAGES = ("encode", "match", "register", "joint", "mesh")
+WRITTEN = ("scene.json", "objects", "embeddings.npz", "report.html", "run.log", "config.yaml")
+EMBEDDING = ("inv", "eqv", "scale", "center", "origin")
+DAMAGE = (KeyError, TypeError, ValueError, IndexError, OSError, EOFError, AttributeError)
+
+
+# --- where it lies ------------------------------------------------------------------------------------------
+
+
+def stored_at(folder: str | Path) -> Path:
+    """The folder that holds the living scene called `folder`: itself, or `.NAME.old` after a swap cut short."""
+    folder = Path(folder).resolve()
+    old = _beside(folder, "old")
+    return old if not folder.exists() and (old / "scene.json").is_file() else folder
+
+
+def check_output(folder: str | Path) -> None:
+    """Raises ValueError unless a living scene may be written to `folder`: new, empty, or a living scene."""
+    folder = Path(folder).resolve()
+    if folder.exists() and not folder.is_dir():
+        raise ValueError(f"{folder}: a file; needed a folder for the living scene")
+    if os.path.ismount(folder):
+        raise ValueError(f"{folder}: a mount point cannot be replaced; needed a folder inside it")
+    if folder.is_dir() and any(folder.iterdir()) and not _is_scene(folder):
+        raise ValueError(f"{folder}: output folder not empty and not a living scene; needed a new folder")
+    parent = next(p for p in folder.parents if p.exists())
+    if not parent.is_dir() or not os.access(parent, os.W_OK):
+        raise ValueError(f"{folder}: cannot write in {parent}; needed a folder that can be written")
+
+
+def _beside(folder: Path, kind: str) -> Path:
+    return folder.with_name(f".{folder.name}.{kind}")
+
+
+def _is_scene(folder: Path) -> bool:
+    try:
+        return "version" in json.loads((folder / "scene.json").read_text())
+    except (OSError, ValueError, TypeError):
+        return False
+
+
+# --- writing ------------------------------------------------------------------------------------------------
+
+
+def save_scene(scene: LivingScene, folder: str | Path, config: SceneConfig, *, log: str = "") -> None:
+    """Writes the living-scene folder, whole or not at all; a living scene already there is replaced.
+
+    `log` is appended to the folder's run.log. Files in the folder that are not part of a living scene are kept.
+    Raises ValueError where `check_output` does, or when a number of the scene is not finite.
+    """
+    check_output(folder)
+    folder = Path(folder).resolve()
+    new, old = _beside(folder, "new"), _beside(folder, "old")
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    if old.exists() and not folder.exists():
+        old.rename(folder)
+    for left_over in (new, old):
+        shutil.rmtree(left_over, ignore_errors=True)
+    try:
+        _fill(new, scene, config, _log_of(folder) + log)
+        _keep_other_files(folder, new)
+    except BaseException:
+        shutil.rmtree(new, ignore_errors=True)
+        raise
+    if folder.exists():
+        folder.rename(old)
+    new.rename(folder)
+    shutil.rmtree(old, ignore_errors=True)
+
+
+def _fill(folder: Path, scene: LivingScene, config: SceneConfig, log: str) -> None:
+    (folder / "objects").mkdir(parents=True)
+    text = json.dumps(scene_to_json(scene), indent=1, allow_nan=False)
+    (folder / "scene.json").write_text(text + "\n", encoding="utf-8")
+    for o in scene.objects:
+        write_points(folder / _points_name(o), o.points, o.point_scan)
+        if o.mesh is not None:
+            write_mesh(folder / _mesh_name(o), o.mesh)
+    stacked = {k: np.stack([np.asarray(getattr(o.embedding, k)) for o in scene.objects]) for k in EMBEDDING}
+    np.savez_compressed(folder / "embeddings.npz", id=np.array([o.id for o in scene.objects]), **stacked)
+    (folder / "config.yaml").write_text(to_yaml(config), encoding="utf-8")
+    (folder / "run.log").write_text(log, encoding="utf-8")
+    write_report(scene, folder / "report.html")
+
+
+def _log_of(folder: Path) -> str:
+    path = folder / "run.log"
+    return path.read_text(encoding="utf-8") if path.is_file() else ""
+
+
+def _keep_other_files(folder: Path, new: Path) -> None:
+    """Copies to `new` what people put into the folder beside the living scene."""
+    for path in folder.iterdir() if folder.is_dir() else ():
+        if path.name in WRITTEN:
+            continue
+        if path.is_dir():
+            shutil.copytree(path, new / path.name, symlinks=True)
+        else:
+            shutil.copy2(path, new / path.name, follow_symlinks=False)
+
+
+def _mesh_name(o: SceneObject) -> str:
+    return f"objects/{o.id}.ply"
+
+
+def _points_name(o: SceneObject) -> str:
+    return f"objects/{o.id}_points.ply"
+
+
+def scene_to_json(scene: LivingScene) -> dict[str, Any]:
+    """The content of scene.json: everything but points, meshes and embeddings. Poses are 4×4, row-major."""
+    return {
+        "version": VERSION,
+        "unit": scene.unit,
+        "preset": scene.preset,
+        "prior": scene.prior,
+        "upright": scene.upright,
+        "scans": [
+            {
+                "index": s.index,
+                "name": s.name,
+                "source": s.source,
+                "instances": [int(i) for i in s.instances],
+                "skipped": [{"what": k.what, "reason": k.reason} for k in s.skipped],
+            }
+            for s in scene.scans
+        ],
+        "objects": [_object_to_json(o) for o in scene.objects],
+        "changes": [
+            {
+                "from": c.from_scan,
+                "to": c.to_scan,
+                "moved": list(c.moved),
+                "static": list(c.static),
+                "added": list(c.added),
+                "removed": list(c.removed),
+            }
+            for c in scene.changes
+        ],
+        "timing_s": {k: float(scene.timing_s.get(k, 0.0)) for k in (*STAGES, *scene.timing_s)},
+    }
+
+
+def _object_to_json(o: SceneObject) -> dict[str, Any]:
+    return {
+        "id": o.id,
+        "label": o.label,
+        "reference_scan": int(o.reference_scan),
+        "observations": [
+            {
+                "scan": int(seen.scan),
+                "instance": int(seen.instance),
+                "T_ref_scan": np.asarray(seen.T_ref_scan, np.float64).tolist(),
+                "score": float(seen.score),
+                "rms_m": float(seen.rms_m),
+                "converged": bool(seen.converged),
+            }
+            for seen in o.observations
+        ],
+        "mesh": None if o.mesh is None else _mesh_name(o),
+        "points": _points_name(o),
+    }
+
+
+# --- reading ------------------------------------------------------------------------------------------------
+
+
+def load_scene(folder: str | Path) -> tuple[LivingScene, SceneConfig]:
+    """Reads a living-scene folder and the settings it was made with.
+
+    Raises ValueError, in one line, when there is no living scene, it is of another version, or it is damaged.
+    """
+    at = stored_at(folder)
+    if not (at / "scene.json").is_file():
+        raise ValueError(f"{folder}: no living scene (no scene.json); `more2 run` makes one")
+    try:
+        content = json.loads((at / "scene.json").read_text(encoding="utf-8"))
+        if (version := content["version"]) == VERSION:
+            return _scene(at, content), load_config(at / "config.yaml", SceneConfig)
+    except DAMAGE as error:
+        raise ValueError(f"{folder}: damaged living scene ({type(error).__name__}: {error})") from error
+    raise ValueError(f"{folder}: living scene of version {version!r}; needed {VERSION}")
+
+
+def _scene(folder: Path, content: dict[str, Any]) -> LivingScene:
+    embeddings = _embeddings(folder / "embeddings.npz")
+    scans = [
+        s | {"instances": tuple(s["instances"]), "skipped": tuple(Skipped(**k) for k in s.get("skipped", []))}
+        for s in content["scans"]
+    ]
+    kinds = ("moved", "static", "added", "removed")
+    return LivingScene(
+        preset=content["preset"],
+        prior=content["prior"],
+        upright=content["upright"],
+        scans=tuple(ScanRecord(**s) for s in scans),
+        objects=tuple(_object(folder, o, embeddings[o["id"]]) for o in content["objects"]),
+        changes=tuple(
+            Changes(from_scan=c["from"], to_scan=c["to"], **{k: tuple(c[k]) for k in kinds})
+            for c in content["changes"]
+        ),
+        timing_s=content["timing_s"],
+        unit=content["unit"],
+    )
+
+
+def _embeddings(path: Path) -> dict[str, Embedding]:
+    with np.load(path, allow_pickle=False) as file:
+        stacked = {k: file[k] for k in EMBEDDING}
+        return {str(i): Embedding(**{k: v[n] for k, v in stacked.items()}) for n, i in enumerate(file["id"])}
+
+
+def _object(folder: Path, o: dict[str, Any], embedding: Embedding) -> SceneObject:
+    points, point_scan = read_points(folder / o["points"])
+    seen = [s | {"T_ref_scan": np.array(s["T_ref_scan"], np.float64)} for s in o["observations"]]
+    return SceneObject(
+        id=o["id"],
+        label=o["label"],
+        reference_scan=o["reference_scan"],
+        observations=tuple(Observation(**s) for s in seen),
+        points=points,
+        point_scan=point_scan,
+        embedding=embedding,
+        mesh=None if o["mesh"] is None else read_mesh(folder / o["mesh"]),
+    )

@@ -1,0 +1,83 @@
+"""The objects of a living scene: how they begin, gain observations, move between scans."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+from more2_jax.config import SceneConfig
+rotation_error_deg = lambda a, b: np.rad2deg(np.arccos(np.clip((np.trace(a.T @ b) - 1) / 2, -1, 1)))
+from more2_jax.types import Changes, Embedding, Instance, Observation, SceneObject
+
+Pose = Float[np.ndarray, "4 4"]
+Points = Float[np.ndarray, "n 3"]
+
+
+def apply_pose(T_a_b: Pose, points: Points) -> Points:
+    """Points of frame b in frame a; float64."""
+    return points @ T_a_b[:3, :3].T + T_a_b[:3, 3]
+
+
+def new_object(number: int, scan: int, instance: Instance, embedding: Embedding) -> SceneObject:
+    """An object seen for the first time: this observation is its reference."""
+    own = Observation(scan=scan, instance=instance.id, T_ref_scan=np.eye(4), score=1.0, rms_m=0.0, converged=True)
+    return SceneObject(
+        id=f"object_{number:03d}",
+        label=instance.label,
+        reference_scan=scan,
+        observations=(own,),
+        points=instance.points,
+        point_scan=np.full(len(instance.points), scan),
+        embedding=embedding,
+    )
+
+
+def seen_again(o: SceneObject, instance: Instance, seen: Observation) -> SceneObject:
+    """The object with one more observation, accumulated in its reference frame; its mesh is out of date."""
+    return dataclasses.replace(
+        o,
+        observations=(*o.observations, seen),
+        points=np.concatenate([o.points, apply_pose(seen.T_ref_scan, instance.points)]),
+        point_scan=np.concatenate([o.point_scan, np.full(len(instance.points), seen.scan)]),
+        mesh=None,
+    )
+
+
+def points_of(o: SceneObject, seen: Observation) -> Points:
+    """The points of one observation, in its scan's frame."""
+    return apply_pose(np.linalg.inv(seen.T_ref_scan), o.points[o.point_scan == seen.scan])
+
+
+def observation_in(o: SceneObject, scan: int) -> Observation | None:
+    """The object's observation in a scan, if it was there."""
+    return next((seen for seen in o.observations if seen.scan == scan), None)
+
+
+def last_center(o: SceneObject) -> Float[np.ndarray, "3"]:
+    """Where the object was when last seen: its accumulated cloud's mean, in that scan's frame."""
+    return apply_pose(np.linalg.inv(o.observations[-1].T_ref_scan), o.points.mean(axis=0, keepdims=True))[0]
+
+
+def motion_between(o: SceneObject, before: Observation, after: Observation) -> tuple[float, float]:
+    """How far (metres, at the object's mean) and by what angle (degrees) it moved, if both scans share a frame."""
+    T_after_before = np.linalg.inv(after.T_ref_scan) @ before.T_ref_scan
+    center = apply_pose(np.linalg.inv(before.T_ref_scan), o.points.mean(axis=0, keepdims=True))
+    distance = float(np.linalg.norm(apply_pose(T_after_before, center) - center))
+    return distance, float(rotation_error_deg(T_after_before[:3, :3], np.eye(3)))
+
+
+def changes_between(objects: Sequence[SceneObject], a: int, b: int, config: SceneConfig) -> Changes:
+    """What moved, stayed, came (also: came back) and went between two scans."""
+    found: dict[str, list[str]] = {"moved": [], "static": [], "added": [], "removed": []}
+    for o in objects:
+        before, after = observation_in(o, a), observation_in(o, b)
+        if before and after:
+            distance, angle_deg = motion_between(o, before, after)
+            still = distance <= config.static_m and angle_deg <= config.static_deg
+            found["static" if still else "moved"].append(o.id)
+        elif before or after:
+            found["removed" if before else "added"].append(o.id)
+    return Changes(from_scan=a, to_scan=b, **{k: tuple(v) for k, v in found.items()})

@@ -1,0 +1,118 @@
+"""The whole method on one page (paper Alg. 1): start a living scene, add scans, reconstruct its objects."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import numpy as np
+
+from more2_jax.config import SceneConfig
+from more2_jax.encoding import embed
+from more2_jax.fitting import embed_accumulated, fit_objects
+from more2_jax.meshing import extract_mesh
+from more2_jax.objects import changes_between, new_object, seen_again
+from more2_jax.prior import Prior
+from more2_jax.tracking import match_scan, register_scan
+from more2_jax.types import Instance, LivingScene, Scan, ScanRecord, SceneObject, Skipped
+
+
+def start_scene(prior: Prior, scan: Scan, config: SceneConfig) -> LivingScene:
+    """The living scene of one scan: every instance is an object, seen once. Raises ValueError if there is none."""
+    instances, skipped = usable(scan, config)
+    timing: dict[str, float] = {}
+    with timed(timing, "encode"):
+        embeddings = embed(prior, [i.points for i in instances])
+    objects = [new_object(k, 0, i, e) for k, (i, e) in enumerate(zip(instances, embeddings, strict=True))]
+    return LivingScene(
+        preset=config.preset,
+        prior=prior.name,
+        upright=config.upright,
+        scans=(record(0, scan, instances, skipped),),
+        objects=tuple(objects),
+        changes=(),
+        timing_s=timing,
+    )
+
+
+def add_scan(prior: Prior, scene: LivingScene, scan: Scan, config: SceneConfig) -> LivingScene:
+    """Matches a new scan's instances to the scene's objects, registers every pair in one call, notes what changed.
+
+    Objects that were absent for a while can come back. Meshes of objects seen again are dropped; `reconstruct`
+    makes them anew. Raises ValueError if the scan has no usable instance.
+    """
+    instances, skipped = usable(scan, config)
+    index, timing, objects = len(scene.scans), dict(scene.timing_s), list(scene.objects)
+    with timed(timing, "encode"):
+        embeddings = embed(prior, [i.points for i in instances])
+    with timed(timing, "match"):
+        pairs = match_scan(objects, instances, embeddings, config)
+    with timed(timing, "register"):
+        found = register_scan(prior, objects, instances, embeddings, pairs, index, config)
+    for k, i, observation in found:
+        objects[k] = seen_again(objects[k], instances[i], observation)
+    if config.accumulate_target:
+        with timed(timing, "encode"):
+            objects = embed_accumulated(prior, objects, [k for k, _, _ in found])
+    known = {i for _, i, _ in found}
+    for i in (i for i in range(len(instances)) if i not in known):
+        objects.append(new_object(len(objects), index, instances[i], embeddings[i]))
+    return dataclasses.replace(
+        scene,
+        scans=(*scene.scans, record(index, scan, instances, skipped)),
+        objects=tuple(objects),
+        changes=(*scene.changes, changes_between(objects, index - 1, index, config)),
+        timing_s=timing,
+    )
+
+
+def reconstruct(prior: Prior, scene: LivingScene, config: SceneConfig) -> LivingScene:
+    """Optimises code and poses of every object seen more than once, all in one call, then extracts meshes.
+
+    Objects that have a mesh have not changed since and are left alone.
+    """
+    timing, objects = dict(scene.timing_s), list(scene.objects)
+    todo = [k for k, o in enumerate(objects) if o.mesh is None]
+    with timed(timing, "joint"):
+        objects = fit_objects(prior, objects, [k for k in todo if len(objects[k].observations) > 1], config)
+    with timed(timing, "mesh"):
+        for k in todo:
+            mesh = extract_mesh(prior, objects[k].embedding, config.meshing, box_half_width(objects[k], config))
+            objects[k] = dataclasses.replace(objects[k], mesh=mesh)
+    changes = tuple(changes_between(objects, c.from_scan, c.to_scan, config) for c in scene.changes)
+    return dataclasses.replace(scene, objects=tuple(objects), changes=changes, timing_s=timing)
+
+
+def box_half_width(o: SceneObject, config: SceneConfig) -> float:
+    """Half the edge of the box to mesh, canonical units: at least the usual, and all of what was seen."""
+    center = np.asarray(o.embedding.center, np.float64) + o.embedding.origin
+    seen = np.quantile(np.abs(o.points - center).max(axis=1), 0.99) / float(o.embedding.scale)
+    return float(np.clip(1.15 * seen, config.meshing.half_width, 3 * config.meshing.half_width))
+
+
+def usable(scan: Scan, config: SceneConfig) -> tuple[list[Instance], tuple[Skipped, ...]]:
+    """The instances with enough points, and what is left out; ValueError if nothing remains."""
+    need = config.min_points
+    small = [i for i in scan.instances if len(i.points) < need]
+    skipped = tuple(
+        Skipped(what=f"instance {i.id}", reason=f"{len(i.points)} points; needed {need}") for i in small
+    )
+    if len(small) == len(scan.instances):
+        raise ValueError(f"{scan.name}: {len(small)} instances, none with {need} points or more; needed one")
+    return [i for i in scan.instances if len(i.points) >= need], (*scan.skipped, *skipped)
+
+
+def record(index: int, scan: Scan, instances: list[Instance], skipped: tuple[Skipped, ...]) -> ScanRecord:
+    """What the scene remembers of a scan."""
+    ids = tuple(i.id for i in instances)
+    return ScanRecord(index=index, name=scan.name, source=scan.source, instances=ids, skipped=skipped)
+
+
+@contextmanager
+def timed(timing: dict[str, float], stage: str) -> Iterator[None]:
+    """Adds the seconds of a stage."""
+    began = time.perf_counter()
+    yield
+    timing[stage] = timing.get(stage, 0.0) + time.perf_counter() - began

@@ -1,0 +1,99 @@
+"""Where registration starts from: poses worth trying for one pair (METHOD 4, and beyond it in `robust`)."""
+
+from __future__ import annotations
+
+import itertools
+
+import jax
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+from jax import Array
+from jaxtyping import Bool, Float
+
+from more2_jax.config import RegistrationConfig
+from more2_jax.geometry import kabsch, kabsch_rotation, principal_axes
+from more2_jax.types import Embedding, pytree
+
+
+@pytree
+class Pair:
+    """A source to be moved onto a target; local frames."""
+
+    source: Float[Array, "*b n 3"]
+    source_mask: Bool[Array, "*b n"]
+    target: Float[Array, "*b m 3"]
+    target_mask: Bool[Array, "*b m"]
+    source_code: Embedding
+    target_code: Embedding
+    offset: Float[Array, "*b 3"]  # source's origin minus target's, metres, in the frame both scans share
+
+
+def embedding_pose(source: Embedding, target: Embedding) -> jaxlie.SE3:
+    """The paper's start: Kabsch on `F_se3 = F_eqv + F_c` as 256 corresponding points (§3.3)."""
+    a, b = source.eqv.T + source.center, target.eqv.T + target.center
+    return kabsch(a, b, jnp.ones(len(a), a.dtype))
+
+
+def candidate_poses(pair: Pair, config: RegistrationConfig, upright: bool) -> jaxlie.SE3:
+    """All starts of a pair, batched."""
+    if config.starts == "embedding":
+        return jax.tree.map(lambda x: x[None], embedding_pose(pair.source_code, pair.target_code))
+    rotations = candidate_rotations(pair, config, upright)
+    from_codes = place(rotations, pair.source_code.center, pair.target_code.center)
+    from_means = place(rotations, _mean(pair.source, pair.source_mask), _mean(pair.target, pair.target_mask))
+    return jax.tree.map(lambda *x: jnp.concatenate(x), from_codes, from_means)
+
+
+def candidate_rotations(pair: Pair, config: RegistrationConfig, upright: bool) -> jaxlie.SO3:
+    """The embedding's rotation, its flips about the target's principal axes, principal axes on principal axes,
+    and turns about the vertical (`upright`) or the 24 rotations of a cube after the embedding's."""
+    by_code = kabsch_rotation(pair.source_code.eqv.T, pair.target_code.eqv.T).as_matrix()
+    source_axes = principal_axes(pair.source, pair.source_mask)
+    target_axes = principal_axes(pair.target, pair.target_mask)
+    flips = jnp.asarray(HALF_TURNS)
+    flipped = target_axes @ flips @ target_axes.T @ by_code  # the first half turn is none at all
+    aligned = target_axes @ flips @ source_axes.T
+    if upright and config.yaw_starts:
+        others = jnp.asarray(yaw_turns(config.yaw_starts))
+    else:
+        others = jnp.asarray(cube_rotations()) @ by_code
+    matrices = jnp.concatenate([flipped, aligned, others.astype(by_code.dtype)])
+    return jax.vmap(jaxlie.SO3.from_matrix)(matrices)
+
+
+def place(
+    rotations: jaxlie.SO3, source_center: Float[Array, "3"], target_center: Float[Array, "3"]
+) -> jaxlie.SE3:
+    """Poses with the given rotations that bring one centre onto the other."""
+
+    def one(rotation: jaxlie.SO3) -> jaxlie.SE3:
+        return jaxlie.SE3.from_rotation_and_translation(rotation, target_center - rotation @ source_center)
+
+    return jax.vmap(one)(rotations)
+
+
+def _mean(points: Float[Array, "n 3"], mask: Bool[Array, " n"]) -> Float[Array, "3"]:
+    return (mask / jnp.maximum(mask.sum(), 1)) @ points
+
+
+HALF_TURNS = np.stack([np.diag(d) for d in ((1.0, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1))]).astype(np.float32)
+
+
+def yaw_turns(count: int) -> Float[np.ndarray, "count 3 3"]:
+    """`count` turns about z, evenly spaced, the first none at all."""
+    angle = 2 * np.pi * np.arange(count) / count
+    zero, one = np.zeros(count), np.ones(count)
+    rows = [[np.cos(angle), -np.sin(angle), zero], [np.sin(angle), np.cos(angle), zero], [zero, zero, one]]
+    return np.moveaxis(np.array(rows), -1, 0).astype(np.float32)
+
+
+def cube_rotations() -> Float[np.ndarray, "24 3 3"]:
+    """The rotations that map a cube onto itself."""
+    turns = []
+    for order in itertools.permutations(range(3)):
+        for signs in itertools.product((1.0, -1.0), repeat=3):
+            matrix = np.diag(signs)[:, order]
+            if np.linalg.det(matrix) > 0:
+                turns.append(matrix)
+    return np.stack(turns).astype(np.float32)
