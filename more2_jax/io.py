@@ -11,10 +11,13 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import zipfile
+import zlib
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import yaml
 
 from more2_jax.config import SceneConfig, load_config, to_yaml
 from more2_jax.meshfile import read_mesh, read_points, write_mesh, write_points
@@ -33,7 +36,19 @@ VERSION = 1
 STAGES = ("encode", "match", "register", "joint", "mesh")
 WRITTEN = ("scene.json", "objects", "embeddings.npz", "report.html", "run.log", "config.yaml")
 EMBEDDING = ("inv", "eqv", "scale", "center", "origin")
-DAMAGE = (KeyError, TypeError, ValueError, IndexError, OSError, EOFError, AttributeError)
+# What NumPy, zipfile, json, yaml and our own records raise for files that are damaged or missing.
+DAMAGE = (
+    KeyError,
+    TypeError,
+    ValueError,
+    IndexError,
+    OSError,
+    EOFError,
+    AttributeError,
+    zipfile.BadZipFile,
+    zlib.error,
+    yaml.YAMLError,
+)
 
 
 # --- where it lies ------------------------------------------------------------------------------------------
@@ -78,9 +93,11 @@ def save_scene(scene: LivingScene, folder: str | Path, config: SceneConfig, *, l
     """Writes the living-scene folder, whole or not at all; a living scene already there is replaced.
 
     `log` is appended to the folder's run.log. Files in the folder that are not part of a living scene are kept.
-    Raises ValueError where `check_output` does, or when a number of the scene is not finite.
+    Raises ValueError where `check_output` does, when a number of the scene is not finite, or without objects.
     """
     check_output(folder)
+    if not scene.objects:
+        raise ValueError("the living scene has no objects; needed at least one")
     folder = Path(folder).resolve()
     new, old = _beside(folder, "new"), _beside(folder, "old")
     folder.parent.mkdir(parents=True, exist_ok=True)
@@ -210,7 +227,8 @@ def load_scene(folder: str | Path) -> tuple[LivingScene, SceneConfig]:
         if (version := content["version"]) == VERSION:
             return _scene(at, content), load_config(at / "config.yaml", SceneConfig)
     except DAMAGE as error:
-        raise ValueError(f"{folder}: damaged living scene ({type(error).__name__}: {error})") from error
+        reason = " ".join(str(error).split())
+        raise ValueError(f"{folder}: damaged living scene ({type(error).__name__}: {reason})") from error
     raise ValueError(f"{folder}: living scene of version {version!r}; needed {VERSION}")
 
 
