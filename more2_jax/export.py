@@ -9,8 +9,11 @@ from types import ModuleType
 
 import numpy as np
 import trimesh
+from trimesh.exchange.gltf import export_glb
+from trimesh.visual import TextureVisuals
+from trimesh.visual.material import PBRMaterial
 
-from more2_jax.io import scene_to_json
+from more2_jax.io import WRITTEN, scene_to_json
 from more2_jax.meshfile import write_points
 from more2_jax.objects import apply_pose, observation_in
 from more2_jax.report import rgb
@@ -22,7 +25,7 @@ SUFFIXES = {"glb": ".glb", "usd": ".usda", "ply": ".ply", "json": ".json"}
 def export_scene(scene: LivingScene, target: str | Path, format: str, *, scan: int = -1) -> Path:
     """Writes the scene as one file and returns its path.
 
-    `target` is a file, or a folder, in which the file is called `scene` and the format's suffix. Lengths are
+    `target` is a file, or a folder, in which the file is called `export` and the format's suffix. Lengths are
     metres, in the frame of the scan shown. `scan` counts from 0, or from the last with −1.
 
     - glb: the meshes (points of objects without one) as they lie in `scan`, one named node an object.
@@ -30,7 +33,8 @@ def export_scene(scene: LivingScene, target: str | Path, format: str, *, scan: i
     - json: poses and changes only, as in the living-scene folder's scene.json.
     - usd: all scans as time samples, 0 the first; needs the extra `usd`.
 
-    Raises ValueError for an unknown format or scan, a scan without objects, or USD without its extra.
+    Raises ValueError for an unknown format or scan, a scan without objects, USD without its extra, or a path
+    that would overwrite part of a living scene.
     """
     if format not in WRITERS:
         raise ValueError(f"format {format!r}; needed one of {', '.join(WRITERS)}")
@@ -39,14 +43,16 @@ def export_scene(scene: LivingScene, target: str | Path, format: str, *, scan: i
             f"scan {scan} of {len(scene.scans)}; needed 0 to {len(scene.scans) - 1}, or −1 for the last"
         )
     target = Path(target)
-    path = target / f"scene{SUFFIXES[format]}" if target.is_dir() else target
+    path = target / f"export{SUFFIXES[format]}" if target.is_dir() else target
+    if path.name in WRITTEN and (path.parent / "scene.json").exists():
+        raise ValueError(f"{path}: part of a living scene; needed another file")
     path.parent.mkdir(parents=True, exist_ok=True)
     WRITERS[format](scene, path, scan % len(scene.scans))
     return path
 
 
 def pose_in(o: SceneObject, scan: int) -> np.ndarray | None:
-    """T_scan_ref, 4×4: takes the object's mesh and accumulated points to where they lie in a scan, if it was there."""
+    """T_scan_ref, 4×4: takes an object's mesh and points to where they lie in a scan; None if absent."""
     seen = observation_in(o, scan)
     return None if seen is None else np.linalg.inv(seen.T_ref_scan)
 
@@ -61,7 +67,7 @@ def _placed(scene: LivingScene, scan: int) -> list[tuple[int, SceneObject, np.nd
 
 
 def _write_glb(scene: LivingScene, path: Path, scan: int) -> None:
-    """Vertices are stored about the object's own centre: glTF has single precision, its nodes take the rest."""
+    """Vertices lie about the object's own centre: glTF has single precision, its nodes take the rest."""
     graph = trimesh.Scene()
     for k, o, T_scan_ref in _placed(scene, scan):
         vertices = o.points if o.mesh is None else o.mesh.vertices
@@ -71,14 +77,14 @@ def _write_glb(scene: LivingScene, path: Path, scan: int) -> None:
             shape = trimesh.PointCloud(vertices - center, colors=np.tile(paint, (len(vertices), 1)))
         else:
             shape = trimesh.Trimesh(vertices - center, o.mesh.faces, process=False)
-            shape.visual = trimesh.visual.TextureVisuals(material=_material(o.id, paint))
+            shape.visual = TextureVisuals(material=_material(o.id, paint))
         T_ref_node = trimesh.transformations.translation_matrix(center)
         graph.add_geometry(shape, node_name=o.id, geom_name=o.id, transform=T_scan_ref @ T_ref_node)
-    path.write_bytes(trimesh.exchange.gltf.export_glb(graph))
+    path.write_bytes(export_glb(graph))
 
 
-def _material(name: str, paint: list[int]) -> trimesh.visual.material.PBRMaterial:
-    return trimesh.visual.material.PBRMaterial(
+def _material(name: str, paint: list[int]) -> PBRMaterial:
+    return PBRMaterial(
         name=name, baseColorFactor=paint, metallicFactor=0.0, roughnessFactor=0.8, doubleSided=True
     )
 

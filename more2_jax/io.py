@@ -55,7 +55,7 @@ DAMAGE = (
 
 
 def stored_at(folder: str | Path) -> Path:
-    """The folder that holds the living scene called `folder`: itself, or `.NAME.old` after a swap cut short."""
+    """The folder that holds the living scene `folder`: itself, or `.NAME.old` after a swap cut short."""
     folder = Path(folder).resolve()
     old = _beside(folder, "old")
     return old if not folder.exists() and (old / "scene.json").is_file() else folder
@@ -92,7 +92,7 @@ def _is_scene(folder: Path) -> bool:
 def save_scene(scene: LivingScene, folder: str | Path, config: SceneConfig, *, log: str = "") -> None:
     """Writes the living-scene folder, whole or not at all; a living scene already there is replaced.
 
-    `log` is appended to the folder's run.log. Files in the folder that are not part of a living scene are kept.
+    `log` is appended to the folder's run.log. Other files in the folder are kept.
     Raises ValueError where `check_output` does, when a number of the scene is not finite, or without objects.
     """
     check_output(folder)
@@ -126,7 +126,8 @@ def _fill(folder: Path, scene: LivingScene, config: SceneConfig, log: str) -> No
         if o.mesh is not None:
             write_mesh(folder / _mesh_name(o), o.mesh)
     stacked = {k: np.stack([np.asarray(getattr(o.embedding, k)) for o in scene.objects]) for k in EMBEDDING}
-    np.savez_compressed(folder / "embeddings.npz", id=np.array([o.id for o in scene.objects]), **stacked)
+    ids = np.array([o.id for o in scene.objects])
+    np.savez_compressed(folder / "embeddings.npz", **({"id": ids} | stacked))  # type: ignore[arg-type]
     (folder / "config.yaml").write_text(to_yaml(config), encoding="utf-8")
     (folder / "run.log").write_text(log, encoding="utf-8")
     write_report(scene, folder / "report.html")

@@ -45,7 +45,7 @@ def write_mesh(path: Path, mesh: Mesh) -> None:
 def read_mesh(path: Path) -> Mesh:
     """Reads a triangle mesh. Raises ValueError if the file is damaged or has other polygons."""
     vertices = read_ply(path).points
-    rows = list(PlyData.read(str(path), mmap=False)["face"].data["vertex_indices"])
+    rows = list(PlyData.read(str(path), mmap=False)["face"].data["vertex_indices"])  # type: ignore[arg-type]
     if any(len(row) != 3 for row in rows):
         raise ValueError(f"{path}: faces of other than three corners; needed triangles")
     return Mesh(vertices=vertices, faces=np.array(rows, np.int32).reshape(-1, 3))

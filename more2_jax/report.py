@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from more2_jax.objects import motion_between, observation_in, points_of
-from more2_jax.types import Changes, LivingScene, SceneObject, ScanRecord
+from more2_jax.types import Changes, LivingScene, ScanRecord, SceneObject
 
 POINTS_SHOWN = 400  # of one object in one plan
 MARGIN = 0.06  # around a plan, share of its longer side
@@ -168,7 +168,7 @@ def _cloud(plan: Float[np.ndarray, "n 2"], paint: str, size: float, name: str) -
     return f'<path class="cloud" stroke="{paint}" stroke-width="{0.012 * size:.4f}" d="{dots}"/>{label}'
 
 
-def _arrow(a: Float[np.ndarray, "2"], b: Float[np.ndarray, "2"], size: float) -> str:
+def _arrow(a: Float[np.ndarray, 2], b: Float[np.ndarray, 2], size: float) -> str:
     if np.linalg.norm(b - a) < 0.02 * size:
         return ""
     return f'<path class="arrow" marker-end="url(#head)" d="M{a[0]:.3f} {a[1]:.3f}L{b[0]:.3f} {b[1]:.3f}"/>'

@@ -1,4 +1,4 @@
-"""A small living scene made by hand: every way an object can come and go, a kilometre from the world's zero."""
+"""A small living scene by hand: every way an object can come and go, a kilometre from the world's zero."""
 
 import numpy as np
 
@@ -76,7 +76,7 @@ def scene_object(
 
 
 def living_scene() -> LivingScene:
-    """Three scans: 0 stands still, 1 moves, 2 is removed, 3 is added, 4 goes and comes back, without a mesh."""
+    """Three scans: 0 stands, 1 moves, 2 is removed, 3 is added, 4 goes and comes back and has no mesh."""
     still, moved = np.eye(4), turn_z(np.deg2rad(90), WORLD_M + [3.0, 0, 0], np.array([0.0, 2.0, 0.0]))
     objects = (
         scene_object(0, {0: still, 1: still, 2: still}, "table"),

@@ -20,7 +20,7 @@ def seen_in(o, scan):
 
 
 def placed(o, points, scan):
-    """The definition: `T_ref_scan` takes points of the scan to the reference, so its inverse takes them back."""
+    """The definition: `T_ref_scan` takes scan points to the reference, so its inverse brings them back."""
     T = np.linalg.inv(seen_in(o, scan).T_ref_scan)
     return (np.c_[points, np.ones(len(points))] @ T.T)[:, :3]
 
@@ -36,7 +36,7 @@ def test_pose_in_undoes_T_ref_scan():
 @pytest.mark.parametrize("scan", [0, 1, 2, -1])
 def test_ply_places_all_points_in_the_scan(tmp_path, scan):
     path = export_scene(SCENE, tmp_path, "ply", scan=scan)
-    assert path == tmp_path / "scene.ply"
+    assert path == tmp_path / "export.ply"
     vertices = PlyData.read(str(path))["vertex"]
     points = np.stack([vertices[a] for a in "xyz"], axis=-1)
     s = scan % 3
@@ -127,3 +127,11 @@ def test_a_scan_without_objects_is_named(tmp_path, format):
     lonely = dataclasses.replace(SCENE, objects=(scene_object(0, {0: np.eye(4)}),))
     with pytest.raises(ValueError, match="shows no object"):
         export_scene(lonely, tmp_path, format, scan=1)
+
+
+def test_a_living_scene_is_not_overwritten(tmp_path):
+    (tmp_path / "scene.json").write_text("{}")
+    with pytest.raises(ValueError, match="part of a living scene"):
+        export_scene(SCENE, tmp_path / "scene.json", "json")
+    assert export_scene(SCENE, tmp_path, "json").name == "export.json"
+    assert (tmp_path / "scene.json").read_text() == "{}"

@@ -1,7 +1,9 @@
 """A living scene comes back from its folder as it went in, and a killed run never leaves half of one."""
 
+import contextlib
 import dataclasses
 import json
+import shutil
 import signal
 import subprocess
 import sys
@@ -89,7 +91,7 @@ def test_a_failing_save_leaves_the_old_folder_and_nothing_beside_it(tmp_path):
     folder = tmp_path / "scene"
     save_scene(living_scene(), folder, CONFIG)
     bad = dataclasses.replace(living_scene(), timing_s={"encode": float("nan")})
-    with pytest.raises(ValueError):
+    with pytest.raises(ValueError, match="JSON"):
         save_scene(bad, folder, CONFIG)
     assert_same(living_scene(), load_scene(folder)[0])
     assert [p.name for p in tmp_path.iterdir()] == ["scene"]
@@ -143,10 +145,8 @@ def test_killed_at_every_step_of_the_swap(tmp_path, monkeypatch):
         with monkeypatch.context() as patch:
             done = _stop_after(patch, steps)
             changed = dataclasses.replace(living_scene(), prior="newer")
-            try:
+            with contextlib.suppress(Killed):
                 save_scene(changed, folder, CONFIG)
-            except Killed:
-                pass
         assert load_scene(folder)[0].prior == ("newer" if done.count("rename") == 2 else "small"), done
         save_scene(living_scene(), folder, CONFIG)
         assert [p.name for p in folder.parent.iterdir()] == ["scene"]
@@ -169,8 +169,6 @@ def _stop_after(patch, steps: int) -> list[str]:
         return step
 
     patch.setattr("pathlib.Path.rename", limited("rename", Path.rename))
-    import shutil
-
     patch.setattr("more2_jax.io.shutil.rmtree", limited("rmtree", shutil.rmtree))
     return done
 
