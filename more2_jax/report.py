@@ -154,7 +154,8 @@ def _plan(
             was = (before[:, :2] - (x, y)) * (1, -1) + (0, height)
             shapes.append(_arrow(was.mean(axis=0), plan.mean(axis=0), size))
     caption = f"<b>{escape(record.name)}</b> {_count(len(record.instances), 'object')}"
-    view = f'viewBox="0 0 {width:.3f} {height:.3f}" font-size="{0.035 * size:.4f}" stroke-width="{0.006 * size:.4f}"'
+    widths = f'font-size="{0.035 * size:.4f}" stroke-width="{0.006 * size:.4f}"'
+    view = f'viewBox="0 0 {width:.3f} {height:.3f}" {widths}'
     return (
         f'<figure><svg {view} role="img">{"".join(shapes)}</svg><figcaption>{caption}</figcaption></figure>'
     )
