@@ -43,7 +43,9 @@ def _sample(
 ) -> TrainingSample:
     cloud_key, query_key = jax.random.split(key)
     views = shapes.views[index]
-    points, mask = jax.vmap(lambda k: partial_cloud(k, views, other, config, count))(jax.random.split(cloud_key))
+    points, mask = jax.vmap(lambda k: partial_cloud(k, views, other, config, count))(
+        jax.random.split(cloud_key)
+    )
     query, sdf = jax.vmap(lambda k: _queries(k, shapes, index, config.queries))(jax.random.split(query_key))
     return TrainingSample(points=points, mask=mask, queries=query, sdf=sdf)
 
@@ -98,9 +100,7 @@ def ball(key: Array, points: Cloud, probability: float) -> Kept:
     return near & jax.random.bernoulli(happens_key, probability)
 
 
-def add_junk(
-    key: Array, points: Cloud, kept: Kept, other: Array, probability: float
-) -> tuple[Cloud, Kept]:
+def add_junk(key: Array, points: Cloud, kept: Kept, other: Array, probability: float) -> tuple[Cloud, Kept]:
     """Replaces up to 15 % of the rows by a fragment of another shape, or by a patch of floor."""
     happens_key, kind_key, count_key, fragment_key, floor_key = jax.random.split(key, 5)
     fragment = _fragment(fragment_key, points, other.reshape(-1, 3).astype(jnp.float32))

@@ -22,7 +22,7 @@ class Shapes:
 
 
 def load_shapes(folder: str | Path, split: str) -> Shapes:
-    """Loads every finished shard of `folder`, `split` 'train' or 'val'. Raises ValueError if there is none."""
+    """Loads every finished shard of `folder`, `split` 'train' or 'val'. ValueError if there is none."""
     parts: dict[str, list[np.ndarray]] = {"views": [], "sdf_uniform": [], "sdf_near": []}
     for path in sorted(Path(folder).glob("*.npz")):
         with np.load(path, allow_pickle=False) as shard:
