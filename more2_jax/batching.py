@@ -11,7 +11,7 @@ from jaxtyping import Float
 from more2_jax.types import PointCloud
 
 MIN_POINTS = 256  # the smallest bucket of points
-MAX_POINTS = 8192  # more than this says nothing new about one object
+MAX_POINTS = 2048  # what a stage looks at of one object; more is kept by the scene, and thinned evenly here
 
 
 def bucket(count: int, smallest: int = 1) -> int:
@@ -23,7 +23,7 @@ def pad_clouds(clouds: Sequence[Float[np.ndarray, "n 3"]], size: int | None = No
     """Batches ragged clouds: (objects, bucket, 3), centred on each cloud's own `origin` (float64).
 
     The point farthest from the mean comes first: farthest-point sampling starts there, so that the order of
-    a cloud's points does not matter. Clouds beyond 8192 points are thinned evenly by index. `size` sets the
+    a cloud's points does not matter. Clouds beyond `MAX_POINTS` are thinned evenly by index. `size` sets the
     bucket. Raises ValueError on an empty list, a shape that is not (n, 3), no points, or points that are not finite.
     """
     if not len(clouds):

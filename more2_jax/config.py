@@ -58,6 +58,7 @@ class MatchingConfig:
     assignment: Literal["hungarian", "greedy"] = "hungarian"
     size_weight: float = 0.0  # how much of a mismatch in metric size is held against a pair
     max_size_ratio: float = 0.0  # 0: any
+    misfit_weight: float = 0.0  # of the residual after coarse registration of the pair, in shares of the radius
     motion_weight: float = 0.0  # a metre moved costs this much score: decides among identical objects
     reject_residual: float = 0.0  # share of the object's radius; a pair above it is not one object. 0: never
 
@@ -66,7 +67,9 @@ class MatchingConfig:
 class RegistrationConfig:
     """Registration of a matched pair (METHOD 4); the defaults are the paper's."""
 
-    points: int = 1024
+    points: int = 1024  # of the farthest-point samples
+    sdf_points: int = 1024  # of them, how many are asked of the field
+    dense: bool = False  # ICP and residual compare a sample with all of the other cloud
     starts: Literal["embedding", "many"] = "embedding"
     identity_start: bool = False  # also try "it did not move", for scans in one frame
     yaw_starts: int = 0  # turns about the vertical, when upright
@@ -99,8 +102,8 @@ class JointConfig:
 class MeshingConfig:
     """Mesh extraction (METHOD 5): multi-resolution iso-surface extraction, then marching cubes."""
 
-    coarse: int = 32
-    resolution: int = 64
+    coarse: int = 32  # cells a side of the first grid
+    resolution: int = 64  # of the last: `coarse`, doubled once or more
     half_width: float = 0.65  # of the query box, canonical units; objects are turned in it, so more than 0.55
 
 
@@ -165,20 +168,28 @@ def preset(name: str, *, upright: bool = False) -> SceneConfig:
             upright=upright,
             accumulate_target=True,
             matching=MatchingConfig(
-                score="inv", size_weight=0.5, max_size_ratio=1.8, motion_weight=0.01, reject_residual=0.08
+                score="inv",
+                size_weight=0.5,
+                max_size_ratio=1.8,
+                misfit_weight=5.0,
+                motion_weight=0.01,
+                reject_residual=0.07,
             ),
             registration=RegistrationConfig(
-                points=512,
+                points=256,
+                sdf_points=128,
+                dense=True,
                 starts="many",
                 identity_start=True,
                 yaw_starts=24 if upright else 0,
-                keep_starts=4,
-                steps=40,
+                keep_starts=3,
+                steps=25,
                 learning_rate=0.01,
-                icp_steps=20,
+                icp_steps=12,
                 trim=0.8,
             ),
-            joint=JointConfig(points=256, start="accumulated", steps=60, eqv_learning_rate=1e-3, pose_learning_rate=5e-4),
+            meshing=MeshingConfig(coarse=16, resolution=64),
+            joint=JointConfig(points=128, start="accumulated", steps=40, eqv_learning_rate=1e-3),
         )
     raise ValueError(f"preset {name!r}; needed 'paper' or 'robust'")
 

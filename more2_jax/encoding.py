@@ -9,23 +9,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
-from more2_jax.batching import bucket, pad_batch, pad_clouds
-from more2_jax.geometry import farthest_points
+from more2_jax.batching import MAX_POINTS, bucket, pad_batch, pad_clouds
 from more2_jax.prior import Prior, encode
 from more2_jax.types import Embedding, PointCloud
 
-WORKING_POINTS = 1024  # what the stages see of an object: a farthest-point sample, in that order
 SMALLEST_BATCH = 8  # scenes of up to so many objects share their compiled programs
-
-_thin = jax.jit(jax.vmap(lambda points, mask: farthest_points(points, mask, WORKING_POINTS)))
 
 
 def padded(clouds: Sequence[Float[np.ndarray, "n 3"]], smallest: int = SMALLEST_BATCH) -> PointCloud:
-    """Ragged clouds as one batch of fixed shape: (bucket, `WORKING_POINTS`, 3). The fillers repeat the first."""
-    cloud = pad_clouds(clouds)
-    cloud = pad_batch(cloud, bucket(len(clouds), smallest))
-    points, mask = _thin(cloud.points, cloud.mask)
-    return PointCloud(points=points, mask=mask, origin=cloud.origin)
+    """Ragged clouds as one batch of one shape for all scenes: (bucket, `MAX_POINTS`, 3). Fillers repeat the first."""
+    return pad_batch(pad_clouds(clouds, MAX_POINTS), bucket(len(clouds), smallest))
 
 
 def embed(prior: Prior, clouds: Sequence[Float[np.ndarray, "n 3"]]) -> list[Embedding]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,7 +15,7 @@ from more2_jax.config import MeshingConfig
 from more2_jax.prior import Prior, sdf_one
 from more2_jax.types import Embedding, Mesh
 
-CHUNK = 16384  # queries a call: one compiled program for every object and resolution
+CHUNK = 8192  # queries a call: one compiled program for every object and resolution
 
 _values = jax.jit(sdf_one)
 
@@ -24,19 +26,18 @@ def extract_mesh(
     """The zero level set of one object's field, metres in its scan's frame, always closed.
 
     `half_width` (canonical units) is half the edge of the query box. Returns None when the field has no zero in
-    the box: there is no surface to show.
+    the box: there is no surface to show. Raises ValueError unless `resolution` is `coarse` doubled some times.
     """
+    doublings = np.log2(config.resolution / config.coarse)
+    if doublings < 0 or doublings != int(doublings):
+        raise ValueError(f"resolution {config.resolution} from coarse {config.coarse}; needed a power of two times it")
     half = half_width or config.half_width
-    coarse = _evaluate(prior, embedding, _grid(config.coarse, half))
-    factor = config.resolution // config.coarse
-    if factor < 1 or config.resolution % config.coarse:
-        raise ValueError(f"resolution {config.resolution} with coarse {config.coarse}; needed a multiple")
-    values = coarse.reshape([config.coarse + 1] * 3)
-    if factor > 1:
-        values = _refine(prior, embedding, values, factor, half)
+    values = _evaluate(prior, embedding, _grid(config.coarse, half)).reshape([config.coarse + 1] * 3)
+    while len(values) - 1 < config.resolution:
+        values = _refine(prior, embedding, values, half)
     if not (values < 0).any():
         return None
-    return _surface(values, embedding, 2 * half / config.resolution, half)
+    return _surface(values, embedding, 2 * half / (len(values) - 1), half)
 
 
 def _grid(cells: int, half: float) -> Float[np.ndarray, "p 3"]:
@@ -57,27 +58,27 @@ def _evaluate(
 
 
 def _refine(
-    prior: Prior, embedding: Embedding, coarse: Float[np.ndarray, "n n n"], factor: int, half: float
+    prior: Prior, embedding: Embedding, coarse: Float[np.ndarray, "n n n"], half: float
 ) -> Float[np.ndarray, "m m m"]:
-    """Fine grid: evaluated near the surface, interpolated elsewhere."""
-    cells = (len(coarse) - 1) * factor
+    """The grid with half the step: evaluated near the surface, interpolated elsewhere."""
+    cells = 2 * (len(coarse) - 1)
     values = zoom(coarse, (cells + 1) / len(coarse), order=1, grid_mode=False)
     near = near_surface(coarse, 2 * half / (len(coarse) - 1))
     fine = np.zeros(values.shape, bool)
-    for corner in np.argwhere(near):
-        low = corner * factor
-        fine[tuple(slice(a, a + factor + 1) for a in low)] = True
-    index = np.argwhere(fine)
-    values[fine] = _evaluate(prior, embedding, index * (2 * half / cells) - half)
+    corners = 2 * np.argwhere(near)
+    for step in itertools.product(range(3), repeat=3):
+        fine[tuple((corners + step).T)] = True
+    fine[::2, ::2, ::2] = False  # known from the coarse grid
+    values[fine] = _evaluate(prior, embedding, np.argwhere(fine) * (2 * half / cells) - half)
     return values
 
 
 def near_surface(values: Float[np.ndarray, "n n n"], cell: float) -> Bool[np.ndarray, "c c c"]:
     """Cells whose corners differ in sign, or are nearer to the surface than the cell's diagonal: a thin leg may
     pass between corners. One ring of cells more, since the field is only nearly a distance."""
-    corners = np.stack(
-        [values[i : i + len(values) - 1, j : j + len(values) - 1, k : k + len(values) - 1] for i in (0, 1) for j in (0, 1) for k in (0, 1)]
-    )
+    n = len(values) - 1
+    offsets = itertools.product((0, 1), repeat=3)
+    corners = np.stack([values[i : i + n, j : j + n, k : k + n] for i, j, k in offsets])
     straddles = (corners.min(axis=0) < 0) & (corners.max(axis=0) >= 0)
     close = np.abs(corners).min(axis=0) < 0.5 * np.sqrt(3) * cell
     return binary_dilation(straddles) | close

@@ -5,6 +5,7 @@ All poses here are `T_target_source` between *local* frames (points relative to 
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from functools import partial
 
@@ -13,17 +14,19 @@ import jax.numpy as jnp
 import jaxlie
 import numpy as np
 from jax import Array
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from scipy.spatial.transform import Rotation
 
 from more2_jax.config import RegistrationConfig
 from more2_jax.descent import adam, descend
 from more2_jax.geometry import (
+    Sampled,
     chamfer_distance,
     cloud_radius,
-    farthest_points,
     icp,
     icp_step,
+    move,
+    sample,
     two_way_rms,
 )
 from more2_jax.prior import Prior, field_sdf, object_field
@@ -31,6 +34,7 @@ from more2_jax.starts import Pair, candidate_poses
 from more2_jax.types import Embedding, PointCloud, Registration, scale_embedding
 
 STILL = 1e-2  # a last ICP step below this (radians, and shares of the radius) has settled
+APART_DEG = 25.0  # refined poses differ by at least this
 EQUAL_RATIO, EQUAL_OFFSET = 1.05, 0.002  # residuals this close say the same (the offset in shares of the radius)
 
 
@@ -53,22 +57,38 @@ def register(
         raise ValueError(f"register got {sizes} sources, targets and their embeddings; needed equal numbers")
     # How far the source's local zero lies from the target's, when both scans share a frame.
     offset = jnp.asarray(np.asarray(source.origin) - np.asarray(target.origin), jnp.float32)
-    pair = Pair(
-        source=source.points,
-        source_mask=source.mask,
-        target=target.points,
-        target_mask=target.mask,
-        source_code=source_embedding.replace(origin=jnp.zeros_like(offset)),  # type: ignore[attr-defined]
-        target_code=target_embedding.replace(origin=jnp.zeros_like(offset)),  # type: ignore[attr-defined]
-        offset=offset,
-    )
-    return register_many(prior, pair, config, upright)
+    zero = jnp.zeros_like(offset)
+    codes = [e.replace(origin=zero) for e in (source_embedding, target_embedding)]  # type: ignore[attr-defined]
+    clouds = (source.points, source.mask, target.points, target.mask)
+    return _register_many(prior, *clouds, *codes, offset, config, upright)
 
 
 @partial(jax.jit, static_argnames=("config", "upright"))
-def register_many(prior: Prior, pair: Pair, config: RegistrationConfig, upright: bool) -> Registration:
+def _register_many(
+    prior: Prior,
+    source: Float[Array, "b n 3"],
+    source_mask: Bool[Array, "b n"],
+    target: Float[Array, "b m 3"],
+    target_mask: Bool[Array, "b m"],
+    source_code: Embedding,
+    target_code: Embedding,
+    offset: Float[Array, "b 3"],
+    config: RegistrationConfig,
+    upright: bool,
+) -> Registration:
     """All pairs of a scene, or of many scenes, in one compiled program."""
-    return jax.vmap(lambda one: register_one(prior, one, config, upright))(pair)
+
+    def one(s: Array, s_mask: Array, t: Array, t_mask: Array, a: Embedding, b: Embedding, shift: Array) -> Registration:
+        pair = Pair(
+            source=sample(s, s_mask, config.points, config.dense),
+            target=sample(t, t_mask, config.points, config.dense),
+            source_code=a,
+            target_code=b,
+            offset=shift,
+        )
+        return register_one(prior, pair, config, upright)
+
+    return jax.vmap(one)(source, source_mask, target, target_mask, source_code, target_code, offset)
 
 
 def register_one(prior: Prior, pair: Pair, config: RegistrationConfig, upright: bool) -> Registration:
@@ -76,8 +96,7 @@ def register_one(prior: Prior, pair: Pair, config: RegistrationConfig, upright: 
 
     Works in units of the target's radius, so that one step size fits a cup and a wardrobe.
     """
-    pair = thin(pair, config.points)
-    radius = cloud_radius(pair.target, pair.target_mask)
+    radius = cloud_radius(pair.target.points, pair.target.mask)
     pair = rescale(pair, 1 / radius)
     starts = keep_best(candidate_poses(pair, config, upright), pair, config)
     refined = jax.vmap(lambda T: refine(prior, T, pair, config))(starts)
@@ -89,18 +108,15 @@ def register_one(prior: Prior, pair: Pair, config: RegistrationConfig, upright: 
     return best.replace(T_target_source=T, rms_m=best.rms_m * radius)  # type: ignore[attr-defined]
 
 
-def thin(pair: Pair, points: int) -> Pair:
-    """Both clouds in farthest-point order, at most `points` each."""
-    source, source_mask = farthest_points(pair.source, pair.source_mask, points)
-    target, target_mask = farthest_points(pair.target, pair.target_mask, points)
-    return pair.replace(source=source, source_mask=source_mask, target=target, target_mask=target_mask)  # type: ignore[attr-defined]
-
-
 def rescale(pair: Pair, factor: Float[Array, ""]) -> Pair:
     """The pair in other units of length."""
-    return pair.replace(  # type: ignore[attr-defined]
-        source=pair.source * factor,
-        target=pair.target * factor,
+    source, target = (
+        cloud.replace(points=cloud.points * factor, dense=cloud.dense * factor)  # type: ignore[attr-defined]
+        for cloud in (pair.source, pair.target)
+    )
+    return Pair(
+        source=source,
+        target=target,
         source_code=scale_embedding(pair.source_code, factor),
         target_code=scale_embedding(pair.target_code, factor),
         offset=pair.offset * factor,
@@ -111,29 +127,79 @@ def keep_best(starts: jaxlie.SE3, pair: Pair, config: RegistrationConfig) -> jax
     """Moves every start by coarse ICP and keeps the `keep_starts` with the lowest residual."""
     if starts.wxyz_xyz.shape[0] <= config.keep_starts:
         return starts
-    coarse = thin(pair, config.coarse_points)
-    clouds = (coarse.source, coarse.source_mask, coarse.target, coarse.target_mask)
-    moved = jax.vmap(lambda T: icp(T, *clouds, config.trim, config.coarse_steps))(starts)
-    misfit = jax.vmap(lambda T: residual(T, coarse, config.trim))(moved)
-    _, best = jax.lax.top_k(-misfit, config.keep_starts)
+    source, target = (
+        sample(cloud.points, cloud.mask, config.coarse_points, dense=False) for cloud in (pair.source, pair.target)
+    )
+    moved = jax.vmap(lambda T: icp(T, source, target, config.trim, config.coarse_steps))(starts)
+    misfit = jax.vmap(lambda T: residual(T, source, target, config.trim))(moved)
+    best = lowest_apart(misfit, moved.rotation(), config.keep_starts)
     return jax.tree.map(lambda x: x[best], moved)
 
 
-def residual(T: jaxlie.SE3, pair: Pair, share: float) -> Float[Array, ""]:
+def lowest_apart(cost: Float[Array, " n"], rotation: jaxlie.SO3, count: int) -> Int[Array, " count"]:
+    """Indices of the `count` lowest costs whose rotations are at least `APART_DEG` from one another.
+
+    Many starts end in the same place; without this the few kept would be copies of one pose.
+    """
+
+    def body(cost: Array, _: None) -> tuple[Array, Array]:
+        best = jnp.argmin(cost)
+        # ⟨q, q'⟩ = cos of half the angle between two rotations, either sign.
+        half = jnp.abs(rotation.wxyz @ rotation.wxyz[best])
+        return jnp.where(half > jnp.cos(jnp.deg2rad(APART_DEG) / 2), jnp.inf, cost), best
+
+    return jax.lax.scan(body, cost, length=count)[1]
+
+
+@partial(jax.jit, static_argnames=("config", "upright"))
+def pairwise_misfit(
+    source: PointCloud,
+    target: PointCloud,
+    source_code: Embedding,
+    target_code: Embedding,
+    config: RegistrationConfig,
+    upright: bool,
+) -> Float[Array, "n m"]:
+    """How badly every source (m) fits every target (n) at the best of few, coarsely refined poses.
+
+    Residuals in shares of the target's radius: geometry's word on who is who, beside the embedding's.
+    """
+    coarse = dataclasses.replace(config, points=config.coarse_points // 2, keep_starts=1, coarse_steps=8)
+
+    def sampled(cloud: PointCloud) -> Sampled:
+        return jax.vmap(lambda p, m: sample(p, m, coarse.points, dense=True))(cloud.points, cloud.mask)
+
+    sources, targets = sampled(source), sampled(target)
+
+    def misfit(s: Sampled, s_code: Embedding, t: Sampled, t_code: Embedding) -> Float[Array, ""]:
+        radius = cloud_radius(t.points, t.mask)
+        pair = Pair(source=s, target=t, source_code=s_code, target_code=t_code, offset=jnp.zeros(3))
+        pair = rescale(pair, 1 / radius)
+        start = jax.tree.map(lambda x: x[0], keep_best(candidate_poses(pair, coarse, upright), pair, coarse))
+        T = icp(start, pair.source, pair.target, coarse.trim, coarse.coarse_steps)
+        return residual(T, pair.source, pair.target, coarse.trim)
+
+    def row(one: tuple[Sampled, Embedding]) -> Float[Array, " m"]:
+        return jax.vmap(lambda s, c: misfit(s, c, *one))(sources, source_code)
+
+    return jax.lax.map(row, (targets, target_code))
+
+
+def residual(T: jaxlie.SE3, source: Sampled, target: Sampled, share: float) -> Float[Array, ""]:
     """Two-way trimmed residual of a pose; infinite if the pose is not finite."""
-    rms = two_way_rms(T @ pair.source, pair.source_mask, pair.target, pair.target_mask, share)
+    rms = two_way_rms(move(T, source), target, share)
     return jnp.where(jnp.isfinite(rms), rms, jnp.inf)
 
 
 def registration_loss(prior: Prior, pair: Pair, config: RegistrationConfig) -> Callable[[jaxlie.SE3], Array]:
     """`L_reg` of the paper as a function of the pose: |Ψ| of the moved source, and chamfer distance."""
-    field = object_field(prior, pair.target_code)
+    field, source, target = object_field(prior, pair.target_code), pair.source, pair.target
+    few, few_mask = source.points[: config.sdf_points], source.mask[: config.sdf_points]
 
     def loss(T: jaxlie.SE3) -> Float[Array, ""]:
-        moved = T @ pair.source
-        distance = jnp.abs(field_sdf(prior, field, moved))
-        sdf = jnp.where(pair.source_mask, distance, 0.0).sum() / jnp.maximum(pair.source_mask.sum(), 1)
-        chamfer = chamfer_distance(moved, pair.source_mask, pair.target, pair.target_mask)
+        distance = jnp.abs(field_sdf(prior, field, T @ few))
+        sdf = jnp.where(few_mask, distance, 0.0).sum() / jnp.maximum(few_mask.sum(), 1)
+        chamfer = chamfer_distance(T @ source.points, source.mask, target.points, target.mask)
         return config.sdf_weight * sdf + config.chamfer_weight * chamfer
 
     return loss
@@ -143,9 +209,8 @@ def refine(prior: Prior, T: jaxlie.SE3, pair: Pair, config: RegistrationConfig) 
     """Descent on `L_reg`, then ICP (paper §3.3). The loss returned is that of the returned pose."""
     loss = registration_loss(prior, pair, config)
     best, _ = descend(loss, T, adam(config.learning_rate), config.steps)
-    clouds = (pair.source, pair.source_mask, pair.target, pair.target_mask)
-    final = icp(best, *clouds, config.trim, config.icp_steps)
-    last = icp_step(final, *clouds, config.trim)
+    final = icp(best, pair.source, pair.target, config.trim, config.icp_steps)
+    last = icp_step(final, pair.source, pair.target, config.trim)
     still = jnp.linalg.norm((last @ final.inverse()).log()) < STILL
     return score_pose(final, still, loss, pair, config)
 
@@ -154,7 +219,7 @@ def score_pose(
     T: jaxlie.SE3, still: Bool[Array, ""], loss: Callable[[jaxlie.SE3], Array], pair: Pair, config: RegistrationConfig
 ) -> Registration:
     """The record of a pose as it is."""
-    misfit = residual(T, pair, config.trim)
+    misfit = residual(T, pair.source, pair.target, config.trim)
     converged = still & (misfit < config.converged_rms)
     return Registration(T_target_source=T, loss=loss(T), rms_m=misfit, converged=converged)
 
@@ -182,9 +247,10 @@ def choose(refined: Registration, pair: Pair, config: RegistrationConfig) -> Reg
 
 def motion(T_target_source: jaxlie.SE3, pair: Pair) -> Float[Array, ""]:
     """Root mean square displacement of the source in the room, if both scans share a frame."""
-    displacement = T_target_source @ pair.source - (pair.source + pair.offset)
-    squared = jnp.where(pair.source_mask, jnp.sum(displacement**2, axis=-1), 0.0)
-    return jnp.sqrt(squared.sum() / jnp.maximum(pair.source_mask.sum(), 1))
+    points, mask = pair.source.points, pair.source.mask
+    displacement = T_target_source @ points - (points + pair.offset)
+    squared = jnp.where(mask, jnp.sum(displacement**2, axis=-1), 0.0)
+    return jnp.sqrt(squared.sum() / jnp.maximum(mask.sum(), 1))
 
 
 def world_pose(

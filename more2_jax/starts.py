@@ -9,10 +9,10 @@ import jax.numpy as jnp
 import jaxlie
 import numpy as np
 from jax import Array
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from more2_jax.config import RegistrationConfig
-from more2_jax.geometry import kabsch, kabsch_rotation, principal_axes
+from more2_jax.geometry import Sampled, kabsch, kabsch_rotation, principal_axes
 from more2_jax.types import Embedding, pytree
 
 
@@ -20,10 +20,8 @@ from more2_jax.types import Embedding, pytree
 class Pair:
     """A source to be moved onto a target; local frames."""
 
-    source: Float[Array, "*b n 3"]
-    source_mask: Bool[Array, "*b n"]
-    target: Float[Array, "*b m 3"]
-    target_mask: Bool[Array, "*b m"]
+    source: Sampled
+    target: Sampled
     source_code: Embedding
     target_code: Embedding
     offset: Float[Array, "*b 3"]  # source's origin minus target's, metres, in the frame both scans share
@@ -41,7 +39,7 @@ def candidate_poses(pair: Pair, config: RegistrationConfig, upright: bool) -> ja
         return jax.tree.map(lambda x: x[None], embedding_pose(pair.source_code, pair.target_code))
     rotations = candidate_rotations(pair, config, upright)
     from_codes = place(rotations, pair.source_code.center, pair.target_code.center)
-    from_means = place(rotations, _mean(pair.source, pair.source_mask), _mean(pair.target, pair.target_mask))
+    from_means = place(rotations, _mean(pair.source), _mean(pair.target))
     return jax.tree.map(lambda *x: jnp.concatenate(x), from_codes, from_means)
 
 
@@ -49,8 +47,8 @@ def candidate_rotations(pair: Pair, config: RegistrationConfig, upright: bool) -
     """The embedding's rotation, its flips about the target's principal axes, principal axes on principal axes,
     and turns about the vertical (`upright`) or the 24 rotations of a cube after the embedding's."""
     by_code = kabsch_rotation(pair.source_code.eqv.T, pair.target_code.eqv.T).as_matrix()
-    source_axes = principal_axes(pair.source, pair.source_mask)
-    target_axes = principal_axes(pair.target, pair.target_mask)
+    source_axes = principal_axes(pair.source.points, pair.source.mask)
+    target_axes = principal_axes(pair.target.points, pair.target.mask)
     flips = jnp.asarray(HALF_TURNS)
     flipped = target_axes @ flips @ target_axes.T @ by_code  # the first half turn is none at all
     aligned = target_axes @ flips @ source_axes.T
@@ -73,8 +71,8 @@ def place(
     return jax.vmap(one)(rotations)
 
 
-def _mean(points: Float[Array, "n 3"], mask: Bool[Array, " n"]) -> Float[Array, "3"]:
-    return (mask / jnp.maximum(mask.sum(), 1)) @ points
+def _mean(cloud: Sampled) -> Float[Array, "3"]:
+    return (cloud.mask / jnp.maximum(cloud.mask.sum(), 1)) @ cloud.points
 
 
 HALF_TURNS = np.stack([np.diag(d) for d in ((1.0, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1))]).astype(np.float32)

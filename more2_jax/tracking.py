@@ -5,15 +5,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
 from more2_jax.config import SceneConfig
-from more2_jax.encoding import padded, stack, with_origin
+from more2_jax.encoding import at_zero, padded, stack, with_origin
 from more2_jax.matching import match_instances
 from more2_jax.objects import last_center, observation_in, points_of
 from more2_jax.prior import Prior
-from more2_jax.registration import register, world_pose
+from more2_jax.registration import pairwise_misfit, register, world_pose
 from more2_jax.types import Embedding, Instance, Observation, PointCloud, Registration, SceneObject
 
 Found = tuple[int, int, float]  # object, instance, score of the match
@@ -25,14 +26,33 @@ def match_scan(
     """One assignment of all objects, present or absent just now, to the instances of a scan."""
     old, real_old = stack([o.embedding for o in objects])
     new, real_new = stack(embeddings)
-    here = np.stack([last_center(o) for o in objects])
-    there = np.stack([i.points.mean(axis=0) for i in instances])
-    distance = np.linalg.norm(here[:, None] - there[None], axis=-1)
-    bonus = np.zeros((len(real_old), len(real_new)), np.float32)
-    bonus[: len(here), : len(there)] = -config.matching.motion_weight * distance
+    bonus = -config.matching.motion_weight * distances(objects, instances, (len(real_old), len(real_new)))
+    if config.matching.misfit_weight:
+        bonus -= config.matching.misfit_weight * misfits(objects, instances, old, new, config)
     matches = match_instances(old, new, config.matching, real_old, real_new, bonus)
     index, score = np.asarray(matches.target_index), np.asarray(matches.score)
     return [(k, int(index[k]), float(score[k])) for k in range(len(objects)) if index[k] >= 0]
+
+
+def distances(
+    objects: Sequence[SceneObject], instances: Sequence[Instance], shape: tuple[int, int]
+) -> Float[np.ndarray, "n m"]:
+    """Metres between where every object was last seen and every instance, in the frame the scans share."""
+    here = np.stack([last_center(o) for o in objects])
+    there = np.stack([i.points.mean(axis=0) for i in instances])
+    result = np.zeros(shape, np.float32)
+    result[: len(here), : len(there)] = np.linalg.norm(here[:, None] - there[None], axis=-1)
+    return result
+
+
+def misfits(
+    objects: Sequence[SceneObject], instances: Sequence[Instance], old: Embedding, new: Embedding, config: SceneConfig
+) -> Float[np.ndarray, "n m"]:
+    """`pairwise_misfit` of every instance with every object; 1 at most, so that one bad pair decides nothing else."""
+    source, target = padded([i.points for i in instances]), padded([target_points(o, config) for o in objects])
+    codes = [at_zero(with_origin(e, np.asarray(c.origin))) for e, c in ((new, source), (old, target))]
+    flat = [c.replace(origin=jnp.zeros((len(c.points), 3))) for c in (source, target)]  # type: ignore[attr-defined]
+    return np.minimum(pairwise_misfit(*flat, *codes, config.registration, config.upright), 1.0)
 
 
 def target_points(o: SceneObject, config: SceneConfig) -> Float[np.ndarray, "n 3"]:
@@ -40,7 +60,8 @@ def target_points(o: SceneObject, config: SceneConfig) -> Float[np.ndarray, "n 3
     if config.accumulate_target:
         return o.points
     reference = observation_in(o, o.reference_scan)
-    assert reference is not None, f"{o.id} has no observation in its reference scan"
+    if reference is None:
+        raise ValueError(f"{o.id} has no observation in its reference scan {o.reference_scan}; needed one")
     return points_of(o, reference)
 
 

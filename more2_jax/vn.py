@@ -32,8 +32,10 @@ def vn_leaky_relu(
 ) -> Float[Array, "*b 3 c"]:
     """Where ⟨q, k⟩ < 0, takes (1 − leak) of the part of q along k away. `d` is c, or 1 to share a direction."""
     along = jnp.sum(q * k, axis=-2, keepdims=True)
-    length = jnp.maximum(jnp.sum(k * k, axis=-2, keepdims=True), TINY)
-    return q - (1.0 - leak) * jnp.minimum(along, 0.0) / length * k
+    length = jnp.sum(k * k, axis=-2, keepdims=True)
+    # A zero direction removes nothing; dividing by 1 there keeps the gradient finite.
+    share = jnp.where(length > TINY, jnp.minimum(along, 0.0) / jnp.where(length > TINY, length, 1.0), 0.0)
+    return q - (1.0 - leak) * share * k
 
 
 class VNLA(nn.Module):
