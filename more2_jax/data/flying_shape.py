@@ -76,7 +76,10 @@ def free_spot(
 def scan_room(
     placed: Sequence[PlacedMesh], room: tuple[float, float], config: SensorConfig, rng: np.random.Generator
 ) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, " n"]]:
-    """What the cameras see: points (metres, room frame) and the object each lies on, −1 for the room."""
+    """What the cameras see: points (metres, room frame) and the object each lies on, −1 for the floor.
+
+    `room` is the furnished floor, x by y metres about the origin; the cameras stand around it.
+    """
     mesh, owner = _assemble(placed, room)
     caster = RayMeshIntersector(mesh)
     seen = [

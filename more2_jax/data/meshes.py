@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import struct
 import zipfile
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -96,7 +97,10 @@ def _read_packed(path: Path) -> Iterator[SourceMesh]:
 
 def _read_folder(path: Path) -> Iterator[SourceMesh]:
     for file in sorted(p for p in path.rglob("*") if p.suffix.lower() in MESH_SUFFIXES):
-        mesh = trimesh.load_mesh(file)
+        try:
+            mesh = trimesh.load_mesh(file)
+        except (ValueError, IndexError, KeyError, OSError, struct.error) as error:
+            raise ValueError(f"{file}: not a readable mesh ({error})") from error
         yield SourceMesh(
             name=str(file.relative_to(path)),
             category=file.parent.name if file.parent != path else "object",
@@ -104,6 +108,16 @@ def _read_folder(path: Path) -> Iterator[SourceMesh]:
             faces=np.asarray(mesh.faces, np.int64),
             source=path.name,
         )
+
+
+def check_mesh(mesh: SourceMesh) -> None:
+    """Raises ValueError if the mesh has no surface, or its faces name vertices that do not exist."""
+    if not len(mesh.vertices) or not len(mesh.faces):
+        raise ValueError(f"{len(mesh.vertices)} vertices, {len(mesh.faces)} faces; needed some of both")
+    first, last = int(mesh.faces.min()), int(mesh.faces.max())
+    if first < 0 or last >= len(mesh.vertices):
+        count = len(mesh.vertices)
+        raise ValueError(f"faces name vertices {first} to {last} of {count}; needed ones that exist")
 
 
 def standing(vertices: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, "v 3"]:

@@ -26,9 +26,10 @@ def load_shapes(folder: str | Path, split: str) -> Shapes:
     parts: dict[str, list[np.ndarray]] = {"views": [], "sdf_uniform": [], "sdf_near": []}
     for path in sorted(Path(folder).glob("*.npz")):
         with np.load(path, allow_pickle=False) as shard:
-            chosen = shard["splits"] == split
-            for name, part in parts.items():
-                part.append(shard[name][chosen])
-    if not parts["views"] or not sum(map(len, parts["views"])):
+            # A shard whose every mesh was rejected is empty, and its arrays have no shape to speak of.
+            if len(chosen := np.flatnonzero(shard["splits"].astype(str) == split)):
+                for name, part in parts.items():
+                    part.append(shard[name][chosen])
+    if not parts["views"]:
         raise ValueError(f"{folder}: no {split} shapes; `python -m train.prepare` makes shards")
     return Shapes(**{name: jnp.asarray(np.concatenate(part)) for name, part in parts.items()})

@@ -14,7 +14,12 @@ SHELL = 0.003  # how much thicker than the soup the solid is: a board without th
 
 
 def canonical(vertices: Float[np.ndarray, "v 3"]) -> tuple[Float[np.ndarray, "v 3"], float]:
-    """Bounding box centred at the origin, longest edge 0.9; and source units per canonical unit."""
+    """Bounding box centred at the origin, longest edge 0.9; and source units per canonical unit.
+
+    Raises ValueError if there are no vertices, or their extent is zero or not finite.
+    """
+    if not len(vertices):
+        raise ValueError("no vertices; needed a shape with some")
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     scale = float((high - low).max()) / 0.9
     if not np.isfinite(scale) or scale <= 0:
@@ -37,7 +42,9 @@ def signed_distances(
     solid, solid_faces = pcu.make_mesh_watertight(
         vertices.astype(np.float64), faces.astype(np.int32), resolution=RESOLUTION
     )
-    index, weights = pcu.sample_mesh_random(solid, solid_faces, QUERIES)
+    # Seed 0 would mean the clock.
+    seed = int(rng.integers(1, 2**31))
+    index, weights = pcu.sample_mesh_random(solid, solid_faces, QUERIES, random_seed=seed)
     on_solid = pcu.interpolate_barycentric_coords(solid_faces, index, weights, solid)
     uniform = rng.uniform(-BOX, BOX, (QUERIES, 3))
     std = np.where(np.arange(QUERIES) % 2, *NEAR_STD)[:, None]

@@ -1,0 +1,67 @@
+"""Catalogue furniture: centimetres and y up become metres and z up; rotation is applied before the size."""
+
+import io
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from more2_jax.data.sweethome3d import read_catalogue
+
+PROPERTIES = """# a catalogue
+license=Public domain
+name#1=Chair
+creator#1=Somebody
+model#1=/models/chair.obj
+width#1=50
+depth#1=60
+height#1=90
+name#2=Lamp
+creator#2=Somebody else
+model#2=/models/chair.obj
+modelRotation#2=0 0 1 0 1 0 -1 0 0
+width#2=20
+depth#2=30
+height#2=40
+"""
+
+
+@pytest.fixture
+def catalogue(tmp_path: Path) -> Path:
+    """Two pieces that share a model: a cube with a spike at the back on top (y up, front towards +z)."""
+    cube = trimesh.creation.box((2, 2, 2))
+    spike = trimesh.Trimesh([[-1, 3, -1], [1, 1, -1], [-1, 1, -1]], [[0, 1, 2]], process=False)
+    buffer = io.StringIO(trimesh.exchange.obj.export_obj(trimesh.util.concatenate([cube, spike])))
+    path = tmp_path / "made.sh3f"
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("PluginFurnitureCatalog.properties", PROPERTIES)
+        archive.writestr("models/chair.obj", buffer.getvalue())
+    return path
+
+
+def test_pieces_stand_in_metres(catalogue: Path):
+    chair, lamp = read_catalogue(catalogue)
+    assert (chair.name, chair.creator, chair.licence, chair.id) == ("Chair", "Somebody", "Public domain", 1)
+    for piece, size in ((chair, (0.5, 0.6, 0.9)), (lamp, (0.2, 0.3, 0.4))):
+        low, high = piece.vertices.min(axis=0), piece.vertices.max(axis=0)
+        np.testing.assert_allclose(high - low, size, atol=1e-9)
+        np.testing.assert_allclose([*(low + high)[:2], low[2]], 0, atol=1e-9)
+    top = chair.vertices[np.argmax(chair.vertices[:, 2])]
+    np.testing.assert_allclose(top, [-0.25, 0.3, 0.9], atol=1e-9)  # the back (−z there) is +y here
+    top = lamp.vertices[np.argmax(lamp.vertices[:, 2])]
+    np.testing.assert_allclose(top, [-0.1, -0.15, 0.4], atol=1e-9)  # turned by +90° about the vertical
+
+
+def test_pieces_are_chosen_by_number(catalogue: Path):
+    assert [piece.name for piece in read_catalogue(catalogue, (2,))] == ["Lamp"]
+
+
+def test_what_is_no_catalogue_is_refused(tmp_path: Path):
+    (tmp_path / "text.sh3f").write_text("nothing")
+    with zipfile.ZipFile(tmp_path / "empty.sh3f", "w") as archive:
+        archive.writestr("other", "")
+    for name in ("text.sh3f", "empty.sh3f", "missing.sh3f"):
+        with pytest.raises(ValueError, match="not a SweetHome3D catalogue"):
+            list(read_catalogue(tmp_path / name))
