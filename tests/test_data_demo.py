@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from more2_jax.data.demo import DemoTruth, demo_ground_truth, demo_scan_paths
 from more2_jax.data.scans import read_scan
@@ -46,11 +46,11 @@ def test_true_poses_put_models_on_the_points(scans: list[Scan], truth: DemoTruth
             R, t = true.T_scan_model[:3, :3], true.T_scan_model[:3, 3]
             surface = truth.surfaces[true.model]
             in_model = (instance.points - t) @ R
-            distance = cKDTree(surface).query(in_model)[0]
+            distance = KDTree(surface).query(in_model)[0]
             assert np.median(distance) < 0.02 and np.quantile(distance, 0.95) < 0.08, true.object
             # The check can fail: a quarter of a turn leaves the points off the surface.
             turned = in_model[:, [1, 0, 2]] * (-1, 1, 1)
-            assert np.mean(cKDTree(surface).query(turned)[0]) > 1.5 * np.mean(distance), true.object
+            assert np.mean(KDTree(surface).query(turned)[0]) > 1.5 * np.mean(distance), true.object
 
 
 def test_who_stays_goes_comes_and_moves(truth: DemoTruth):

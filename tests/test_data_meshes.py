@@ -42,6 +42,15 @@ def test_a_collection_without_categories_is_named_after_its_file(tmp_path: Path)
     assert [m.category for m in read_meshes(tmp_path / "infinigen_Stool.npz")] == ["Stool"]
 
 
+def test_trash_cans_get_a_size_and_nothing_else_does(tmp_path: Path):
+    wide = [mesh("TrashFactory_0001", (1.2, 1.2, 1.5)), mesh("ChairFactory_0001", (1.2, 1.2, 1.5))]
+    write_packed(tmp_path / "two.npz", wide)
+    can, chair = (np.ptp(m.vertices, axis=0) for m in read_meshes(tmp_path / "two.npz"))
+    assert 0.25 <= can[2] <= 0.7
+    np.testing.assert_allclose(can / can[2], [0.8, 0.8, 1], atol=1e-3)
+    np.testing.assert_allclose(chair, [1.2, 1.2, 1.5], atol=1e-3)
+
+
 def test_a_folder_of_meshes(tmp_path: Path):
     (tmp_path / "chair").mkdir()
     trimesh.creation.box((1, 2, 3)).export(tmp_path / "chair" / "one.obj")

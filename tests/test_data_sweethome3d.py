@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from trimesh.exchange.obj import export_obj
 
 from more2_jax.data.sweethome3d import read_catalogue
 
@@ -33,7 +34,7 @@ def catalogue(tmp_path: Path) -> Path:
     """Two pieces that share a model: a cube with a spike at the back on top (y up, front towards +z)."""
     cube = trimesh.creation.box((2, 2, 2))
     spike = trimesh.Trimesh([[-1, 3, -1], [1, 1, -1], [-1, 1, -1]], [[0, 1, 2]], process=False)
-    buffer = io.StringIO(trimesh.exchange.obj.export_obj(trimesh.util.concatenate([cube, spike])))
+    buffer = io.StringIO(export_obj(trimesh.util.concatenate([cube, spike])))
     path = tmp_path / "made.sh3f"
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr("PluginFurnitureCatalog.properties", PROPERTIES)

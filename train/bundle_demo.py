@@ -51,7 +51,7 @@ def main(catalogue: Path, out: Path = Path("more2_jax/assets/demo"), seed: int =
         for k, f in pieces.items()
     }
     (out / "ground_truth.json").write_text(json.dumps({"models": models, "scans": truth}, indent=1))
-    np.savez_compressed(out / "ground_truth_surfaces.npz", **surfaces(pieces, rng))
+    np.savez_compressed(out / "ground_truth_surfaces.npz", **surfaces(pieces, rng))  # pyright: ignore[reportArgumentType]
     (out / "LICENSES.md").write_text(licences(pieces))
 
 

@@ -123,7 +123,7 @@ def write_shard(path: Path, shapes: list[dict[str, Any]]) -> None:
     keys = ("views", "sdf_uniform", "sdf_near", "names", "categories", "sources", "splits", "scale_m")
     partial = path.with_suffix(".partial")
     with partial.open("wb") as file:
-        np.savez(file, **{k: np.array([s[k] for s in shapes]) for k in keys})
+        np.savez(file, **{k: np.array([s[k] for s in shapes]) for k in keys})  # pyright: ignore[reportArgumentType]
     partial.replace(path)
 
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 import trimesh
 from jaxtyping import Float, Int
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 from trimesh.ray.ray_pyembree import RayMeshIntersector
 
@@ -112,13 +112,13 @@ def hemisphere_scan(
 def _assemble(placed: Sequence[PlacedMesh], room: tuple[float, float]) -> tuple[trimesh.Trimesh, np.ndarray]:
     floor = trimesh.creation.box(extents=(room[0], room[1], 0.1))
     floor.apply_translation((0, 0, -0.05))
-    parts, owner = [floor], [np.full(len(floor.faces), -1)]
-    for index, thing in enumerate(placed):
-        part = trimesh.Trimesh(thing.vertices, thing.faces, process=False)
-        part.apply_transform(thing.T_room_model)
-        parts.append(part)
-        owner.append(np.full(len(part.faces), index))
-    return trimesh.util.concatenate(parts), np.concatenate(owner)
+    vertices, faces = [np.asarray(floor.vertices)], [np.asarray(floor.faces)]
+    for thing in placed:
+        R, t = thing.T_room_model[:3, :3], thing.T_room_model[:3, 3]
+        faces.append(thing.faces + sum(map(len, vertices)))
+        vertices.append(thing.vertices @ R.T + t)
+    owner = np.repeat(np.arange(-1, len(placed)), [len(f) for f in faces])
+    return trimesh.Trimesh(np.concatenate(vertices), np.concatenate(faces), process=False), owner
 
 
 def camera_poses(
@@ -175,8 +175,8 @@ def yaw_symmetry(
     `tolerance` of the diagonal.
     """
     mesh = trimesh.Trimesh(vertices, faces, process=False)
-    points, _ = trimesh.sample.sample_surface(mesh, 8000, seed=seed)
-    tree, diagonal = cKDTree(points), np.linalg.norm(np.ptp(points, axis=0))
+    points = trimesh.sample.sample_surface(mesh, 8000, seed=seed)[0]
+    tree, diagonal = KDTree(points), np.linalg.norm(np.ptp(points, axis=0))
 
     def same(degrees: float) -> bool:
         turned = points @ Rotation.from_euler("z", degrees, degrees=True).as_matrix().T

@@ -30,7 +30,7 @@ class SourceMesh:
     @property
     def digest(self) -> int:
         """A number that depends on the name alone: orders and splits collections the same way everywhere."""
-        return int(hashlib.sha1(self.name.encode()).hexdigest(), 16)
+        return name_digest(self.name)
 
 
 def read_meshes(path: str | Path) -> Iterator[SourceMesh]:
@@ -89,10 +89,23 @@ def _read_packed(path: Path) -> Iterator[SourceMesh]:
         yield SourceMesh(
             name=str(name),
             category=str(category),
-            vertices=lo + v / LEVELS * (hi - lo),
+            vertices=_in_metres(str(name), lo + v / LEVELS * (hi - lo)),
             faces=f.astype(np.int64),
             source=path.name,
         )
+
+
+def _in_metres(name: str, vertices: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, "v 3"]:
+    """Infinigen's trash cans alone are not metric: they get a height of 0.25 to 0.7 m, which the name decides."""
+    if not name.startswith("TrashFactory"):
+        return vertices
+    share = name_digest(name) % 1000 / 999
+    return vertices * ((0.25 + 0.45 * share) / np.ptp(vertices[:, 2]))
+
+
+def name_digest(name: str) -> int:
+    """A large number that depends on the name alone, the same on every machine."""
+    return int(hashlib.sha1(name.encode()).hexdigest(), 16)
 
 
 def _read_folder(path: Path) -> Iterator[SourceMesh]:

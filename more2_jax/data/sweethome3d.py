@@ -47,9 +47,7 @@ def _piece(archive: zipfile.ZipFile, properties: dict[str, str], number: int) ->
         return properties.get(f"{key}#{number}", "").strip()
 
     data = archive.read(get("model").lstrip("/"))
-    mesh = trimesh.load(
-        io.BytesIO(data), file_type=Path(get("model")).suffix[1:], force="mesh", process=False
-    )
+    mesh = trimesh.load_mesh(io.BytesIO(data), file_type=Path(get("model")).suffix[1:], process=False)
     vertices = np.asarray(mesh.vertices, np.float64)
     if rotation := get("modelRotation"):
         vertices = vertices @ np.array(rotation.split(), np.float64).reshape(3, 3).T
