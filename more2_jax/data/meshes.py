@@ -96,7 +96,7 @@ def _read_packed(path: Path) -> Iterator[SourceMesh]:
 
 
 def _in_metres(name: str, vertices: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, "v 3"]:
-    """Infinigen's trash cans alone are not metric: they get a height of 0.25 to 0.7 m, which the name decides."""
+    """Infinigen's trash cans alone are not metric: the name decides on a height of 0.25 to 0.7 m."""
     if not name.startswith("TrashFactory"):
         return vertices
     share = name_digest(name) % 1000 / 999
