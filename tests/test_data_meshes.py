@@ -104,7 +104,8 @@ def test_standing():
 
 def test_unseen_furniture_is_metric_and_every_piece_is_attributed():
     found = list(read_meshes(UNSEEN))
-    assert len(found) >= 12 and len({m.name for m in found}) == len(found)
+    assert len(found) >= 12
+    assert len({m.name for m in found}) == len(found)
     assert UNSEEN.stat().st_size <= 600_000
     licences = UNSEEN.with_suffix(".LICENSES.md").read_text()
     for m in found:
@@ -120,7 +121,8 @@ def test_ikea_gets_a_size_and_stands_up(tmp_path: Path):
     (chair,) = read_ikea(tmp_path / "ikea.npz")
     longest = IKEA_LONGEST_M["Chair"]
     np.testing.assert_allclose(np.ptp(chair.vertices, axis=0), [longest / 4, longest / 4, longest], atol=1e-4)
-    assert chair.category == "chair" and abs(chair.vertices[:, 2].min()) < 1e-9
+    assert chair.category == "chair"
+    assert abs(chair.vertices[:, 2].min()) < 1e-9
     write_packed(tmp_path / "ikea.npz", [dataclasses.replace(tall, name="Boat_x")])
     with pytest.raises(ValueError, match="category 'Boat'"):
         list(read_ikea(tmp_path / "ikea.npz"))

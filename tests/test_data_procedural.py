@@ -12,7 +12,8 @@ from more2_jax.data.procedural import CATEGORIES, procedural_mesh, procedural_me
 def test_every_piece_is_one_closed_solid_on_the_floor(category: str, seed: int):
     piece = procedural_mesh(category, seed)
     solid = trimesh.Trimesh(piece.vertices, piece.faces, process=False)
-    assert solid.is_watertight and solid.volume > 0
+    assert solid.is_watertight
+    assert solid.volume > 0
     assert solid.body_count == 1
     assert solid.bounds[0, 2] == pytest.approx(0, abs=1e-9)
     assert 0.2 < solid.extents.max() < 2.6

@@ -37,7 +37,8 @@ def shapes(count: int = 4) -> Shapes:
 def test_clean_samples_are_points_of_the_chosen_shape():
     index = jnp.array([2, 0])
     sample = draw(jax.random.key(0), shapes(), index, CLEAN, 64)
-    assert sample.points.shape == (2, 2, 64, 3) and sample.queries.shape == (2, 2, 64, 3)
+    assert sample.points.shape == (2, 2, 64, 3)
+    assert sample.queries.shape == (2, 2, 64, 3)
     for row, radius in zip(range(2), (0.3, 0.1), strict=True):
         for cloud in range(2):
             points = sample.points[row, cloud][sample.mask[row, cloud]]
@@ -61,13 +62,15 @@ def test_merged_views_are_at_most_so_many():
     views = jnp.broadcast_to(jnp.arange(24.0)[:, None, None], (24, 384, 3))  # view v lies at (v, v, v)
     merged = np.asarray(jax.vmap(lambda k: merge_views(k, views, 3, 256))(KEYS))
     seen = [len(np.unique(cloud)) for cloud in merged]
-    assert max(seen) == 3 and min(seen) == 1
+    assert max(seen) == 3
+    assert min(seen) == 1
 
 
 def test_a_half_space_cuts_a_share_on_one_side_of_a_plane():
     gone = np.asarray(jax.vmap(lambda k: half_space(k, CLOUD, 1.0))(KEYS))
     share = gone.mean(axis=1)
-    assert 0.04 < share.min() < 0.08 and 0.35 < share.max() < 0.41
+    assert 0.04 < share.min() < 0.08
+    assert 0.35 < share.max() < 0.41
     assert not np.asarray(jax.vmap(lambda k: half_space(k, CLOUD, 0.0))(KEYS)).any()
     some = np.asarray(jax.vmap(lambda k: half_space(k, CLOUD, 0.4))(KEYS)).any(axis=1).mean()
     assert some == pytest.approx(0.4, abs=0.11)  # three standard errors of 200 draws
@@ -104,7 +107,8 @@ def test_junk_replaces_at_most_15_percent_and_counts_as_kept():
     floor_only = [(f[c]).all() for f, c in zip(on_floor, changed, strict=True) if c.any()]
     assert 0.3 < np.mean(floor_only) < 0.7  # the other half are fragments
     clean, kept = jax.vmap(lambda k: add_junk(k, CLOUD, nothing, other, 0.0))(KEYS[:5])
-    assert not kept.any() and (np.asarray(clean) == np.asarray(CLOUD)).all()
+    assert not kept.any()
+    assert (np.asarray(clean) == np.asarray(CLOUD)).all()
 
 
 def test_sampling_starts_at_the_kept_point_farthest_out():

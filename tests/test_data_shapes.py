@@ -119,6 +119,6 @@ def test_a_slender_shape_repeats_points_and_one_too_slender_is_refused():
     )
     distinct = [len(np.unique(view, axis=0)) for view in views]
     assert max(distinct) < POINTS_A_VIEW
+    needle = trimesh.creation.box((1e-5, 1e-5, 0.9))
     with pytest.raises(ValueError, match="hits; needed 32"):
-        needle = trimesh.creation.box((1e-5, 1e-5, 0.9))
         depth_views(np.asarray(needle.vertices), np.asarray(needle.faces), np.random.default_rng(0))
