@@ -1,3 +1,97 @@
-"""Living scenes (MoRE², CVPR 2024) in JAX."""
+"""Living scenes (MoRE², CVPR 2024) in JAX: which object is which, where each moved, one mesh for each."""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
 
 __version__ = "0.1.0"
+
+# Public names and where they live. Imported on first use: `more2 --help` need not wait for JAX.
+_HOMES = {
+    "types": (
+        "PointCloud",
+        "Embedding",
+        "Matches",
+        "Registration",
+        "Mesh",
+        "Instance",
+        "Scan",
+        "LivingScene",
+    ),
+    "config": ("SceneConfig", "load_config", "preset"),
+    "prior": ("Prior", "encode", "init_prior", "load_prior", "save_prior", "sdf"),
+    "batching": ("pad_clouds",),
+    "geometry": ("chamfer_distance", "kabsch"),
+    "matching": ("match_instances",),
+    "registration": ("register", "world_pose"),
+    "meshing": ("extract_mesh",),
+    "joint": ("fit_jointly",),
+    "scene": ("add_scan", "reconstruct", "start_scene"),
+    "data.scans": ("read_scan",),
+    "io": ("load_scene", "save_scene"),
+}
+_HOME_OF = {name: module for module, names in _HOMES.items() for name in names}
+
+if TYPE_CHECKING:
+    from more2_jax.batching import pad_clouds
+    from more2_jax.config import SceneConfig, load_config, preset
+    from more2_jax.data.scans import read_scan
+    from more2_jax.geometry import chamfer_distance, kabsch
+    from more2_jax.io import load_scene, save_scene
+    from more2_jax.joint import fit_jointly
+    from more2_jax.matching import match_instances
+    from more2_jax.meshing import extract_mesh
+    from more2_jax.prior import Prior, encode, init_prior, load_prior, save_prior, sdf
+    from more2_jax.registration import register, world_pose
+    from more2_jax.scene import add_scan, reconstruct, start_scene
+    from more2_jax.types import (
+        Embedding,
+        Instance,
+        LivingScene,
+        Matches,
+        Mesh,
+        PointCloud,
+        Registration,
+        Scan,
+    )
+
+__all__ = [
+    "Embedding",
+    "Instance",
+    "LivingScene",
+    "Matches",
+    "Mesh",
+    "PointCloud",
+    "Prior",
+    "Registration",
+    "Scan",
+    "SceneConfig",
+    "add_scan",
+    "chamfer_distance",
+    "encode",
+    "extract_mesh",
+    "fit_jointly",
+    "init_prior",
+    "kabsch",
+    "load_config",
+    "load_prior",
+    "load_scene",
+    "match_instances",
+    "pad_clouds",
+    "preset",
+    "read_scan",
+    "reconstruct",
+    "register",
+    "save_prior",
+    "save_scene",
+    "sdf",
+    "start_scene",
+    "world_pose",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name in _HOME_OF:
+        return getattr(importlib.import_module(f"more2_jax.{_HOME_OF[name]}"), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -118,7 +118,9 @@ def _stored_tensor(storage: Any, offset: Any, shape: Any, strides: Any, *_unused
     dtype, key, elements = storage
     numbers = (elements, offset, *shape, *strides)
     if len(shape) != len(strides) or not all(isinstance(n, int) and n >= 0 for n in numbers):
-        raise ValueError(f"a tensor of shape {shape}, strides {strides}, offset {offset} in {elements} elements")
+        raise ValueError(
+            f"a tensor of shape {shape}, strides {strides}, offset {offset} in {elements} elements"
+        )
     return StoredTensor(dtype, key, elements, offset, tuple(shape), tuple(strides))
 
 
@@ -141,7 +143,9 @@ def read_checkpoint(path: str | Path) -> dict[str, np.ndarray]:
     if not path.is_file():
         raise ValueError(f"{path}: no such file")
     if not zipfile.is_zipfile(path):
-        raise ValueError(f"{path}: {_what_instead(path)}; needed a checkpoint that torch.save of 1.6 or later wrote")
+        raise ValueError(
+            f"{path}: {_what_instead(path)}; needed a checkpoint that torch.save of 1.6 or later wrote"
+        )
     try:
         with zipfile.ZipFile(path) as archive:
             root = _root(archive)
@@ -210,7 +214,9 @@ def _load(archive: zipfile.ZipFile, folder: str, tensor: StoredTensor, order: st
     last = tensor.offset + sum((n - 1) * s for n, s in zip(tensor.shape, tensor.strides, strict=True))
     count = int(np.prod(tensor.shape, dtype=object))
     if record.file_size != size or count > tensor.elements or (count and last >= tensor.elements):
-        raise ValueError(f"storage {tensor.key} of {record.file_size} bytes does not hold a tensor of {tensor.shape}")
+        raise ValueError(
+            f"storage {tensor.key} of {record.file_size} bytes does not hold a tensor of {tensor.shape}"
+        )
     raw = np.frombuffer(archive.read(record), _ordered(tensor.dtype, order))
     if not count:
         return np.zeros(tensor.shape, tensor.dtype)
@@ -220,7 +226,7 @@ def _load(archive: zipfile.ZipFile, folder: str, tensor: StoredTensor, order: st
 
 
 def _ordered(dtype: np.dtype[Any], order: str) -> np.dtype[Any]:
-    return dtype.newbyteorder(order) if dtype.kind != "V" else dtype
+    return dtype.newbyteorder(">" if order == ">" else "<") if dtype.kind != "V" else dtype
 
 
 # --- parity -------------------------------------------------------------------------------------------------
@@ -243,10 +249,14 @@ def read_reference(path: str | Path) -> dict[str, np.ndarray]:
 
 def _check_reference(reference: Mapping[str, np.ndarray], where: str) -> None:
     if missing := [name for name in ("points", "queries", *OUTPUTS) if name not in reference]:
-        raise ValueError(f"{where}: no array {', '.join(missing)}; needed points, queries, {', '.join(OUTPUTS)}")
+        raise ValueError(
+            f"{where}: no array {', '.join(missing)}; needed points, queries, {', '.join(OUTPUTS)}"
+        )
     shapes = {name: reference[name].shape for name in ("points", "queries", *OUTPUTS)}
     if len(shapes["points"]) != 3 or len(shapes["queries"]) != 3 or len(shapes["F_inv"]) != 2:
-        raise ValueError(f"{where}: got shapes {shapes}; needed points (b, n, 3), queries (b, q, 3), F_inv (b, c)")
+        raise ValueError(
+            f"{where}: got shapes {shapes}; needed points (b, n, 3), queries (b, q, 3), F_inv (b, c)"
+        )
     (b, n, _), q, c = shapes["points"], shapes["queries"][1], shapes["F_inv"][1]
     needed = {
         "points": (b, n, 3),
@@ -300,7 +310,9 @@ def check_prior(weights: Mapping[str, np.ndarray], reference: Mapping[str, np.nd
 def _run(
     prior: Prior, points: Float[Array, "b n 3"], queries: Float[Array, "b q 3"]
 ) -> tuple[Embedding, Float[Array, "b q"]]:
-    def one(points: Float[Array, "n 3"], queries: Float[Array, "q 3"]) -> tuple[Embedding, Float[Array, " q"]]:
+    def one(
+        points: Float[Array, "n 3"], queries: Float[Array, "q 3"]
+    ) -> tuple[Embedding, Float[Array, " q"]]:
         ordered = farthest_points(points, jnp.ones(len(points), bool), len(points))
         embedding = encode_ordered(prior, *ordered)
         return embedding, sdf_one(prior, embedding, queries)

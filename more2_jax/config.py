@@ -58,7 +58,9 @@ class MatchingConfig:
     assignment: Literal["hungarian", "greedy"] = "hungarian"
     size_weight: float = 0.0  # how much of a mismatch in metric size is held against a pair
     max_size_ratio: float = 0.0  # 0: any
-    misfit_weight: float = 0.0  # of the residual after coarse registration of the pair, in shares of the radius
+    misfit_weight: float = (
+        0.0  # of the residual after coarse registration of the pair, in shares of the radius
+    )
     motion_weight: float = 0.0  # a metre moved costs this much score: decides among identical objects
     reject_residual: float = 0.0  # share of the object's radius; a pair above it is not one object. 0: never
 
@@ -90,7 +92,9 @@ class JointConfig:
     """Joint optimisation (METHOD 6); the defaults are the paper's."""
 
     points: int = 1024
-    start: Literal["best", "accumulated"] = "best"  # F_0: code of the observation with the lowest L_sdf, or of all
+    start: Literal["best", "accumulated"] = (
+        "best"  # F_0: code of the observation with the lowest L_sdf, or of all
+    )
     steps: int = 200
     eqv_learning_rate: float = 1e-4
     pose_learning_rate: float = 5e-5
@@ -116,7 +120,9 @@ class SceneConfig:
     min_points: int = 64  # objects seen with fewer are skipped, and reported
     static_deg: float = 1.0  # below both: static
     static_m: float = 0.05
-    accumulate_target: bool = False  # match and register against all seen so far, not the reference observation
+    accumulate_target: bool = (
+        False  # match and register against all seen so far, not the reference observation
+    )
     matching: MatchingConfig = field(default_factory=MatchingConfig)
     registration: RegistrationConfig = field(default_factory=RegistrationConfig)
     joint: JointConfig = field(default_factory=JointConfig)
@@ -173,7 +179,7 @@ def preset(name: str, *, upright: bool = False) -> SceneConfig:
                 max_size_ratio=1.8,
                 misfit_weight=5.0,
                 motion_weight=0.01,
-                reject_residual=0.07,
+                reject_residual=0.06,
             ),
             registration=RegistrationConfig(
                 points=256,
@@ -185,8 +191,8 @@ def preset(name: str, *, upright: bool = False) -> SceneConfig:
                 keep_starts=3,
                 steps=25,
                 learning_rate=0.01,
-                icp_steps=12,
-                trim=0.8,
+                icp_steps=8,
+                trim=0.7,
             ),
             meshing=MeshingConfig(coarse=16, resolution=64),
             joint=JointConfig(points=128, start="accumulated", steps=40, eqv_learning_rate=1e-3),
@@ -201,7 +207,9 @@ def from_dict(cls: type[C], values: dict[str, Any], where: str = "") -> C:
     hints = typing.get_type_hints(cls)
     names = {f.name for f in dataclasses.fields(cls)}  # type: ignore[arg-type]
     if unknown := sorted(set(values) - names):
-        raise ValueError(f"{where or 'settings'}: unknown {', '.join(unknown)}; known are {', '.join(sorted(names))}")
+        raise ValueError(
+            f"{where or 'settings'}: unknown {', '.join(unknown)}; known are {', '.join(sorted(names))}"
+        )
     built = {key: _convert(hints[key], value, f"{where}.{key}".lstrip(".")) for key, value in values.items()}
     return cls(**built)
 
@@ -212,7 +220,9 @@ def _convert(hint: Any, value: Any, where: str) -> Any:
     origin = typing.get_origin(hint)
     if origin is Literal:
         if value not in typing.get_args(hint):
-            raise ValueError(f"{where}: got {value!r}, needed one of {', '.join(map(repr, typing.get_args(hint)))}")
+            raise ValueError(
+                f"{where}: got {value!r}, needed one of {', '.join(map(repr, typing.get_args(hint)))}"
+            )
         return value
     if origin is tuple:
         if not isinstance(value, list | tuple):

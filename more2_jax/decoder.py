@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float
 
-from more2_jax.config import DecoderConfig, PriorConfig
+from more2_jax.config import PriorConfig
 from more2_jax.types import Embedding, pytree
 
 Affine = tuple[Float[Array, "4 h"], Float[Array, " h"]]
@@ -59,7 +59,10 @@ class Decoder(nn.Module):
         """Every hidden layer's kernel and bias, weight normalisation applied."""
         d = self.config.decoder
         inputs = [self.input_width] + [d.hidden] * (d.layers - 1)
-        return [dense(i if n != d.skip_layer else d.hidden) for n, (dense, i) in enumerate(zip(self.hidden, inputs))]
+        return [
+            dense(i if n != d.skip_layer else d.hidden)
+            for n, (dense, i) in enumerate(zip(self.hidden, inputs, strict=True))
+        ]
 
     def field(self, embedding: Embedding) -> ObjectField:
         """Folds one object's code into the two layers that see it."""

@@ -46,7 +46,11 @@ def score_object(o: SceneObject, truth: DemoTruth) -> DemoScore:
     reference, seen = o.observations[0], o.observations[1:]
     mine = truth.at(reference.scan, reference.instance)
     others = [truth.at(s.scan, s.instance) for s in seen]
-    errors = [pose_error(mine, other, s, truth) for s, other in zip(seen, others, strict=True) if other.model == mine.model]
+    errors = [
+        pose_error(mine, other, s, truth)
+        for s, other in zip(seen, others, strict=True)
+        if other.model == mine.model
+    ]
     stood = {one.scan for one in truth.instances if one.object == mine.object and one.scan >= reference.scan}
     return DemoScore(
         name=mine.object,
@@ -81,7 +85,7 @@ def mesh_error(o: SceneObject, mine: TrueInstance, truth: DemoTruth) -> float:
     if o.mesh is None:
         return float("nan")
     mesh = trimesh.Trimesh(o.mesh.vertices, o.mesh.faces, process=False)
-    points, _ = trimesh.sample.sample_surface(mesh, 10_000, seed=0)
+    points = trimesh.sample.sample_surface(mesh, 10_000, seed=0)[0]
     surface: Float[np.ndarray, "n 3"] = apply_pose(mine.T_scan_model, truth.surfaces[mine.model])
     return float(chamfer_l1(np.asarray(points), surface))
 
@@ -112,4 +116,7 @@ def demo_table(scene: LivingScene) -> tuple[Table, str]:
         )
     stay = persisting(truth)
     right = {s.name for s in scores if s.right and s.name in stay}
-    return table, f"{len(right)} of {len(stay)} persisting objects right (matched in every scan, pose < {RIGHT_DEG:g}°)"
+    return (
+        table,
+        f"{len(right)} of {len(stay)} persisting objects right (matched in every scan, pose < {RIGHT_DEG:g}°)",
+    )

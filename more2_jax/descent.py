@@ -44,7 +44,9 @@ def descend(
         return (jaxlie.manifold.rplus(value, updates), state, best, best_loss), None
 
     state = optimiser.init(jaxlie.manifold.zero_tangents(start))
-    (value, _, best, best_loss), _ = jax.lax.scan(step, (start, state, start, jnp.inf), length=steps)
+    (value, _, best, best_loss), _ = jax.lax.scan(
+        step, (start, state, start, jnp.array(jnp.inf)), length=steps
+    )
     return keep_better(value, loss_fn(value), best, best_loss)
 
 

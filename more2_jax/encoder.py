@@ -6,12 +6,21 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 from jax import Array
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 
 from more2_jax.config import EncoderConfig
 from more2_jax.types import Embedding
-from more2_jax.vn import TINY, VNLA, EdgeVNLA, channel_normalise, masked_mean, nearest_features, norm, vn_leaky_relu
-from more2_jax.vn import kernel_init
+from more2_jax.vn import (
+    TINY,
+    VNLA,
+    EdgeVNLA,
+    channel_normalise,
+    kernel_init,
+    masked_mean,
+    nearest_features,
+    norm,
+    vn_leaky_relu,
+)
 
 Features = Float[Array, "n 3 c"]
 Edges = Float[Array, "n k 3 c"]
@@ -161,5 +170,3 @@ def neighbour_counts(config: EncoderConfig, points: int) -> list[int]:
         counts.append(points)
         points //= thinning.get(i, 1)
     return counts
-
-

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 
 import jax
@@ -29,10 +30,12 @@ def embed(prior: Prior, clouds: Sequence[Float[np.ndarray, "n 3"]]) -> list[Embe
 def unstack(batch: Embedding, count: int) -> list[Embedding]:
     """The first `count` embeddings of a batch, as host arrays."""
     host = jax.device_get(batch)
-    return [jax.tree.map(lambda x: np.asarray(x[k]), host) for k in range(count)]
+    return [jax.tree.map(lambda x, k=k: np.asarray(x[k]), host) for k in range(count)]
 
 
-def stack(embeddings: Sequence[Embedding], smallest: int = SMALLEST_BATCH) -> tuple[Embedding, Bool[np.ndarray, " b"]]:
+def stack(
+    embeddings: Sequence[Embedding], smallest: int = SMALLEST_BATCH
+) -> tuple[Embedding, Bool[np.ndarray, " b"]]:
     """A batch of fixed size and which of its rows are real; the fillers repeat the first."""
     count = bucket(len(embeddings), smallest)
     rows = [*embeddings, *[embeddings[0]] * (count - len(embeddings))]
@@ -42,9 +45,9 @@ def stack(embeddings: Sequence[Embedding], smallest: int = SMALLEST_BATCH) -> tu
 def with_origin(e: Embedding, origin: Float[np.ndarray, "*b 3"]) -> Embedding:
     """The same embedding, its centre relative to another origin; the difference is taken in float64."""
     center = np.asarray(e.center, np.float64) + np.asarray(e.origin) - origin
-    return e.replace(center=jnp.asarray(center, jnp.float32), origin=np.asarray(origin))  # type: ignore[attr-defined]
+    return dataclasses.replace(e, center=jnp.asarray(center, jnp.float32), origin=np.asarray(origin))
 
 
 def at_zero(e: Embedding) -> Embedding:
     """The embedding with its local frame for a frame: what traced code takes."""
-    return e.replace(origin=jnp.zeros_like(e.center))  # type: ignore[attr-defined]
+    return dataclasses.replace(e, origin=jnp.zeros_like(e.center))

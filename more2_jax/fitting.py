@@ -20,7 +20,9 @@ from more2_jax.registration import world_pose
 from more2_jax.types import SceneObject
 
 
-def embed_accumulated(prior: Prior, objects: Sequence[SceneObject], chosen: Sequence[int]) -> list[SceneObject]:
+def embed_accumulated(
+    prior: Prior, objects: Sequence[SceneObject], chosen: Sequence[int]
+) -> list[SceneObject]:
     """Encodes the accumulated clouds of the `chosen` objects; the others stay as they are."""
     result = list(objects)
     if chosen:
@@ -40,9 +42,12 @@ def fit_objects(
     fit = jax.device_get(fit_jointly(prior, seen, config.joint))
     embeddings = unstack(fit.embedding, len(chosen))
     for n, k in enumerate(chosen):
-        local = [jax.tree.map(lambda x, n=n, j=j: x[n, j], fit.T_ref_obs) for j in range(len(objects[k].observations))]
+        local = [
+            jax.tree.map(lambda x, n=n, j=j: x[n, j], fit.T_ref_obs)
+            for j in range(len(objects[k].observations))
+        ]
         poses = [world_pose(T, origins[n, 0], origins[n, j]) for j, T in enumerate(local)]
-        embedding = embeddings[n].replace(origin=origins[n, 0])  # type: ignore[attr-defined]
+        embedding = dataclasses.replace(embeddings[n], origin=origins[n, 0])
         result[k] = dataclasses.replace(repose(objects[k], poses), embedding=embedding)
     return result
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import jaxlie
@@ -54,6 +56,14 @@ def sample(points: Float[Array, "n 3"], mask: Bool[Array, " n"], count: int, den
     return Sampled(points=sparse, mask=sparse_mask, dense=sparse, dense_mask=sparse_mask)
 
 
+def evenly(cloud: Sampled, every: int) -> Sampled:
+    """The cloud sampled as densely as it was seen: every so-manieth of its rows, in place of the farthest points.
+
+    Farthest points seek out the outliers; these weigh the surface by what the sensor saw of it.
+    """
+    return dataclasses.replace(cloud, points=cloud.dense[::every], mask=cloud.dense_mask[::every])
+
+
 def nearest(
     a: Float[Array, "n 3"], a_mask: Bool[Array, " n"], b: Float[Array, "m 3"], b_mask: Bool[Array, " m"]
 ) -> tuple[Int[Array, " n"], Float[Array, " n"]]:
@@ -66,7 +76,9 @@ def nearest(
     return index, jnp.where(a_mask & b_mask[index], squared, FAR)
 
 
-def _nearest_index(a: Float[Array, "n 3"], b: Float[Array, "m 3"], b_mask: Bool[Array, " m"]) -> Int[Array, " n"]:
+def _nearest_index(
+    a: Float[Array, "n 3"], b: Float[Array, "m 3"], b_mask: Bool[Array, " m"]
+) -> Int[Array, " n"]:
     offset = [(a[:, None, i] - b[None, :, i]).astype(jnp.float32) for i in range(3)]
     squared = offset[0] ** 2 + offset[1] ** 2 + offset[2] ** 2
     # The bits of floats ≥ 0 are ordered as the floats are. With the column number in the lowest bits one plain
@@ -87,16 +99,18 @@ def trimmed(squared: Float[Array, " n"], share: float) -> Bool[Array, " n"]:
 
 
 def two_way_rms(a: Sampled, b: Sampled, share: float) -> Float[Array, ""]:
-    """Trimmed root mean square nearest distance, metres: of a's sample to b, of b's to a; the worse counts.
+    """Trimmed root mean square nearest distance, metres: of a's sample to b and of b's to a, then their mean.
 
-    The worse, not the mean: a small fragment fits snugly inside many places of a large cloud.
+    The mean, not the worse: where one scan saw more of an object than the other, only the way from the smaller to
+    the larger tells right from wrong.
     """
-    means = []
+    total = jnp.zeros((), a.points.dtype)
     for one, other in ((a, b), (b, a)):
         _, squared = nearest(one.points, one.mask, other.dense, other.dense_mask)
         kept = trimmed(squared, share)
-        means.append(jnp.where(kept, squared, 0.0).sum() / jnp.maximum(kept.sum(), 1))
-    return jnp.sqrt(jnp.maximum(means[0], means[1]))
+        mean = jnp.where(kept, squared, 0.0).sum() / jnp.maximum(kept.sum(), 1)
+        total += 0.5 * jnp.sqrt(jnp.maximum(mean, TINY))
+    return total
 
 
 def chamfer_distance(
@@ -178,7 +192,7 @@ def cloud_radius(points: Float[Array, "n 3"], mask: Bool[Array, " n"]) -> Float[
 
 def move(T_a_b: jaxlie.SE3, cloud: Sampled) -> Sampled:
     """The cloud in frame a."""
-    return cloud.replace(points=T_a_b @ cloud.points, dense=T_a_b @ cloud.dense)  # type: ignore[attr-defined]
+    return dataclasses.replace(cloud, points=T_a_b @ cloud.points, dense=T_a_b @ cloud.dense)
 
 
 def icp_step(T: jaxlie.SE3, source: Sampled, target: Sampled, share: float) -> jaxlie.SE3:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from functools import partial
 from typing import Any
 
@@ -10,6 +11,7 @@ import jax.numpy as jnp
 import jaxlie
 import optax
 from jax import Array
+from jax.core import Tracer
 from jaxtyping import Bool, Float
 
 from more2_jax.config import JointConfig
@@ -36,8 +38,10 @@ def fit_jointly(prior: Prior, observations: Observations, config: JointConfig) -
 
     Raises ValueError when an object has no reference observation.
     """
-    if not isinstance(observations.real, jax.core.Tracer) and not bool(observations.real[:, 0].all()):
-        raise ValueError("fit_jointly got an object without observation 0; needed the reference observation there")
+    if not isinstance(observations.real, Tracer) and not bool(observations.real[:, 0].all()):
+        raise ValueError(
+            "fit_jointly got an object without observation 0; needed the reference observation there"
+        )
     return _fit_many(prior, observations, config)
 
 
@@ -55,13 +59,13 @@ def fit_one(prior: Prior, seen: Observations, config: JointConfig) -> JointFit:
     free = {"inv": start.inv, "eqv": start.eqv, "center": start.center, "pose": seen.T_ref_obs}
 
     def loss(free: dict[str, Any]) -> Float[Array, ""]:
-        code = start.replace(inv=free["inv"], eqv=free["eqv"], center=free["center"])  # type: ignore[attr-defined]
+        code = dataclasses.replace(start, inv=free["inv"], eqv=free["eqv"], center=free["center"])
         return surface_loss(prior, code, free["pose"], seen) + departure(code, start)
 
     best, lowest = descend(loss, free, optimiser(config), config.steps)
     # The reference observation defines the frame: all is moved back by what it drifted.
     drift = jax.tree.map(lambda x: x[0], best["pose"]).inverse()
-    code = start.replace(inv=best["inv"], eqv=best["eqv"], center=best["center"])  # type: ignore[attr-defined]
+    code = dataclasses.replace(start, inv=best["inv"], eqv=best["eqv"], center=best["center"])
     poses = jax.vmap(lambda T: drift @ T)(best["pose"])
     return JointFit(
         embedding=scale_embedding(move_embedding(code, drift), radius),
@@ -116,12 +120,13 @@ def best_code(prior: Prior, seen: Observations) -> Embedding:
 def thin(seen: Observations, points: int) -> Observations:
     """Every cloud in farthest-point order, at most `points`."""
     clouds, mask = jax.vmap(lambda p, m: farthest_points(p, m, points))(seen.points, seen.mask)
-    return seen.replace(points=clouds, mask=mask)  # type: ignore[attr-defined]
+    return dataclasses.replace(seen, points=clouds, mask=mask)
 
 
 def rescale(seen: Observations, factor: Float[Array, ""]) -> Observations:
     """The observations in other units of length."""
-    return seen.replace(  # type: ignore[attr-defined]
+    return dataclasses.replace(
+        seen,
         points=seen.points * factor,
         codes=scale_embedding(seen.codes, factor),
         accumulated=scale_embedding(seen.accumulated, factor),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from functools import partial
 
 import jax
@@ -107,7 +108,7 @@ def match_instances(
     extra = np.zeros((n, m), np.float32) if bonus is None else np.asarray(bonus, np.float32)
     if extra.shape != (n, m):
         raise ValueError(f"match_instances got a bonus of shape {extra.shape}; needed {(n, m)}")
-    plain = [e.replace(origin=jnp.zeros_like(e.center)) for e in (source, target)]  # type: ignore[attr-defined]
+    plain = [dataclasses.replace(e, origin=jnp.zeros_like(e.center)) for e in (source, target)]
     return _match(*plain, config, jnp.asarray(real), jnp.asarray(other), jnp.asarray(extra))
 
 

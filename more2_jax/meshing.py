@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 
 import jax
@@ -30,7 +31,9 @@ def extract_mesh(
     """
     doublings = np.log2(config.resolution / config.coarse)
     if doublings < 0 or doublings != int(doublings):
-        raise ValueError(f"resolution {config.resolution} from coarse {config.coarse}; needed a power of two times it")
+        raise ValueError(
+            f"resolution {config.resolution} from coarse {config.coarse}; needed a power of two times it"
+        )
     half = half_width or config.half_width
     values = _evaluate(prior, embedding, _grid(config.coarse, half)).reshape([config.coarse + 1] * 3)
     while len(values) - 1 < config.resolution:
@@ -49,7 +52,7 @@ def _evaluate(
     prior: Prior, embedding: Embedding, canonical: Float[np.ndarray, "p 3"]
 ) -> Float[np.ndarray, " p"]:
     """Field at canonical offsets from the centre, in chunks of one fixed size."""
-    local = embedding.replace(origin=jnp.zeros(3))  # type: ignore[attr-defined]
+    local = dataclasses.replace(embedding, origin=jnp.zeros(3))
     points = (canonical * float(embedding.scale) + np.asarray(embedding.center)).astype(np.float32)
     padded = np.zeros((-(-len(points) // CHUNK) * CHUNK, 3), np.float32)
     padded[: len(points)] = points
@@ -62,9 +65,9 @@ def _refine(
 ) -> Float[np.ndarray, "m m m"]:
     """The grid with half the step: evaluated near the surface, interpolated elsewhere."""
     cells = 2 * (len(coarse) - 1)
-    values = zoom(coarse, (cells + 1) / len(coarse), order=1, grid_mode=False)
+    values = np.asarray(zoom(coarse, (cells + 1) / len(coarse), order=1, grid_mode=False))
     near = near_surface(coarse, 2 * half / (len(coarse) - 1))
-    fine = np.zeros(values.shape, bool)
+    fine = np.zeros([cells + 1] * 3, bool)
     corners = 2 * np.argwhere(near)
     for step in itertools.product(range(3), repeat=3):
         fine[tuple((corners + step).T)] = True
@@ -84,9 +87,7 @@ def near_surface(values: Float[np.ndarray, "n n n"], cell: float) -> Bool[np.nda
     return binary_dilation(straddles) | close
 
 
-def _surface(
-    values: Float[np.ndarray, "m m m"], embedding: Embedding, step: float, half: float
-) -> Mesh:
+def _surface(values: Float[np.ndarray, "m m m"], embedding: Embedding, step: float, half: float) -> Mesh:
     # A ring of outside around the box closes surfaces that reach its border.
     padded = np.pad(values, 1, constant_values=max(float(values.max()), step))
     vertices, faces, _, _ = marching_cubes(padded, 0.0, gradient_direction="ascent")

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from more2_jax.config import SceneConfig
-rotation_error_deg = lambda a, b: np.rad2deg(np.arccos(np.clip((np.trace(a.T @ b) - 1) / 2, -1, 1)))
+from more2_jax.metrics import rotation_error_deg
 from more2_jax.types import Changes, Embedding, Instance, Observation, SceneObject
 
 Pose = Float[np.ndarray, "4 4"]
@@ -23,7 +23,9 @@ def apply_pose(T_a_b: Pose, points: Points) -> Points:
 
 def new_object(number: int, scan: int, instance: Instance, embedding: Embedding) -> SceneObject:
     """An object seen for the first time: this observation is its reference."""
-    own = Observation(scan=scan, instance=instance.id, T_ref_scan=np.eye(4), score=1.0, rms_m=0.0, converged=True)
+    own = Observation(
+        scan=scan, instance=instance.id, T_ref_scan=np.eye(4), score=1.0, rms_m=0.0, converged=True
+    )
     return SceneObject(
         id=f"object_{number:03d}",
         label=instance.label,

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax.traverse_util import flatten_dict, unflatten_dict
 from jax import Array
+from jax.core import Tracer
 from jaxtyping import Bool, Float
 
 from more2_jax.config import PriorConfig, from_dict
@@ -76,9 +77,9 @@ def encode(prior: Prior, cloud: PointCloud) -> Embedding:
     """
     if cloud.points.ndim != 3:
         raise ValueError(f"encode got points of shape {cloud.points.shape}; needed (batch, n, 3)")
-    if not isinstance(cloud.mask, jax.core.Tracer) and (empty := np.flatnonzero(~np.asarray(cloud.mask.any(-1)))).size:
+    if not isinstance(cloud.mask, Tracer) and (empty := np.flatnonzero(~np.asarray(cloud.mask.any(-1)))).size:
         raise ValueError(f"clouds {empty.tolist()} have no points; encode needs at least one each")
-    return _encode_many(prior, cloud.points, cloud.mask).replace(origin=cloud.origin)  # type: ignore[attr-defined]
+    return dataclasses.replace(_encode_many(prior, cloud.points, cloud.mask), origin=cloud.origin)
 
 
 def object_field(prior: Prior, embedding: Embedding) -> ObjectField:
@@ -109,9 +110,12 @@ def sdf(prior: Prior, embedding: Embedding, points: Float[Array, "b n 3"]) -> Fl
     Multiply by `embedding.scale` for metres; negative inside (paper §3.1). Raises ValueError on shapes that differ.
     """
     if points.ndim != 3 or points.shape[0] != embedding.scale.shape[0]:
-        raise ValueError(f"sdf got points {points.shape} for {embedding.scale.shape} objects; needed (objects, n, 3)")
-    local = points - embedding.origin[:, None]
-    return _sdf_many(prior, embedding.replace(origin=jnp.zeros_like(embedding.center)), jnp.asarray(local, jnp.float32))  # type: ignore[attr-defined]
+        raise ValueError(
+            f"sdf got points {points.shape} for {embedding.scale.shape} objects; needed (objects, n, 3)"
+        )
+    local = jnp.asarray(points - embedding.origin[:, None], jnp.float32)
+    at_zero = dataclasses.replace(embedding, origin=jnp.zeros_like(embedding.center))
+    return _sdf_many(prior, at_zero, local)
 
 
 def save_prior(prior: Prior, path: str | Path, half: bool = True) -> None:
@@ -119,7 +123,8 @@ def save_prior(prior: Prior, path: str | Path, half: bool = True) -> None:
     flat = flatten_dict(jax.device_get(prior.params), sep="/")
     kind = np.float16 if half else np.float32
     header = json.dumps({"format": FORMAT, "name": prior.name, "config": dataclasses.asdict(prior.config)})
-    np.savez_compressed(path, __header__=np.array(header), **{k: np.asarray(v, kind) for k, v in flat.items()})
+    arrays: dict[str, Any] = {k: np.asarray(v, kind) for k, v in flat.items()}
+    np.savez_compressed(path, __header__=np.array(header), **arrays)
 
 
 def load_prior(name: str | Path) -> Prior:
@@ -130,13 +135,19 @@ def load_prior(name: str | Path) -> Prior:
             header = json.loads(str(file["__header__"]))
             flat = {k: jnp.asarray(file[k], jnp.float32) for k in file.files if k != "__header__"}
     except (KeyError, ValueError, OSError, EOFError) as error:
-        raise ValueError(f"{path}: not a more2_jax weight file ({error}); `more2 prior import` makes one") from error
+        raise ValueError(
+            f"{path}: not a more2_jax weight file ({error}); `more2 prior import` makes one"
+        ) from error
     if header.get("format") != FORMAT:
         raise ValueError(f"{path}: weight format {header.get('format')!r}; needed {FORMAT}")
     config = from_dict(PriorConfig, header["config"], where=str(path))
     prior = Prior(params=unflatten_dict(flat, sep="/"), config=config, name=header["name"])
     check_shapes(prior, str(path))
     return prior
+
+
+def _flat(params: dict[str, Any]) -> dict[str, Any]:
+    return dict(flatten_dict(params, sep="/"))
 
 
 def _locate(name: str | Path) -> Path:
@@ -157,8 +168,7 @@ def shipped_priors() -> list[str]:
 def check_shapes(prior: Prior, where: str) -> None:
     """Raises ValueError, naming the first array that is missing, unknown or of another shape."""
     model = jax.eval_shape(lambda key: init_prior(prior.config, key).params, jax.random.key(0))
-    needed = {k: v.shape for k, v in flatten_dict(model, sep="/").items()}
-    got = {k: np.shape(v) for k, v in flatten_dict(prior.params, sep="/").items()}
+    needed, got = ({k: jnp.shape(v) for k, v in _flat(tree).items()} for tree in (model, prior.params))
     for name in sorted(needed | got):
         if needed.get(name) != got.get(name):
             raise ValueError(f"{where}: weights {name} have shape {got.get(name)}; needed {needed.get(name)}")

@@ -23,6 +23,7 @@ from more2_jax.geometry import (
     Sampled,
     chamfer_distance,
     cloud_radius,
+    evenly,
     icp,
     icp_step,
     move,
@@ -35,7 +36,10 @@ from more2_jax.types import Embedding, PointCloud, Registration, scale_embedding
 
 STILL = 1e-2  # a last ICP step below this (radians, and shares of the radius) has settled
 APART_DEG = 25.0  # refined poses differ by at least this
-EQUAL_RATIO, EQUAL_OFFSET = 1.05, 0.002  # residuals this close say the same (the offset in shares of the radius)
+EQUAL_RATIO, EQUAL_OFFSET = (
+    1.03,
+    0.001,
+)  # residuals this close say the same (the offset in shares of the radius)
 
 
 def register(
@@ -58,7 +62,7 @@ def register(
     # How far the source's local zero lies from the target's, when both scans share a frame.
     offset = jnp.asarray(np.asarray(source.origin) - np.asarray(target.origin), jnp.float32)
     zero = jnp.zeros_like(offset)
-    codes = [e.replace(origin=zero) for e in (source_embedding, target_embedding)]  # type: ignore[attr-defined]
+    codes = [dataclasses.replace(e, origin=zero) for e in (source_embedding, target_embedding)]
     clouds = (source.points, source.mask, target.points, target.mask)
     return _register_many(prior, *clouds, *codes, offset, config, upright)
 
@@ -78,7 +82,9 @@ def _register_many(
 ) -> Registration:
     """All pairs of a scene, or of many scenes, in one compiled program."""
 
-    def one(s: Array, s_mask: Array, t: Array, t_mask: Array, a: Embedding, b: Embedding, shift: Array) -> Registration:
+    def one(
+        s: Array, s_mask: Array, t: Array, t_mask: Array, a: Embedding, b: Embedding, shift: Array
+    ) -> Registration:
         pair = Pair(
             source=sample(s, s_mask, config.points, config.dense),
             target=sample(t, t_mask, config.points, config.dense),
@@ -105,13 +111,13 @@ def register_one(prior: Prior, pair: Pair, config: RegistrationConfig, upright: 
     best = choose(refined, pair, config)
     T = best.T_target_source
     T = jaxlie.SE3.from_rotation_and_translation(T.rotation(), T.translation() * radius)
-    return best.replace(T_target_source=T, rms_m=best.rms_m * radius)  # type: ignore[attr-defined]
+    return dataclasses.replace(best, T_target_source=T, rms_m=best.rms_m * radius)
 
 
 def rescale(pair: Pair, factor: Float[Array, ""]) -> Pair:
     """The pair in other units of length."""
     source, target = (
-        cloud.replace(points=cloud.points * factor, dense=cloud.dense * factor)  # type: ignore[attr-defined]
+        dataclasses.replace(cloud, points=cloud.points * factor, dense=cloud.dense * factor)
         for cloud in (pair.source, pair.target)
     )
     return Pair(
@@ -128,7 +134,8 @@ def keep_best(starts: jaxlie.SE3, pair: Pair, config: RegistrationConfig) -> jax
     if starts.wxyz_xyz.shape[0] <= config.keep_starts:
         return starts
     source, target = (
-        sample(cloud.points, cloud.mask, config.coarse_points, dense=False) for cloud in (pair.source, pair.target)
+        sample(cloud.points, cloud.mask, config.coarse_points, dense=False)
+        for cloud in (pair.source, pair.target)
     )
     moved = jax.vmap(lambda T: icp(T, source, target, config.trim, config.coarse_steps))(starts)
     misfit = jax.vmap(lambda T: residual(T, source, target, config.trim))(moved)
@@ -164,7 +171,14 @@ def pairwise_misfit(
 
     Residuals in shares of the target's radius: geometry's word on who is who, beside the embedding's.
     """
-    coarse = dataclasses.replace(config, points=config.coarse_points // 2, keep_starts=1, coarse_steps=8)
+    coarse = dataclasses.replace(
+        config,
+        points=48,
+        coarse_points=48,
+        keep_starts=1,
+        coarse_steps=6,
+        yaw_starts=min(config.yaw_starts, 12),
+    )
 
     def sampled(cloud: PointCloud) -> Sampled:
         return jax.vmap(lambda p, m: sample(p, m, coarse.points, dense=True))(cloud.points, cloud.mask)
@@ -209,17 +223,27 @@ def refine(prior: Prior, T: jaxlie.SE3, pair: Pair, config: RegistrationConfig) 
     """Descent on `L_reg`, then ICP (paper §3.3). The loss returned is that of the returned pose."""
     loss = registration_loss(prior, pair, config)
     best, _ = descend(loss, T, adam(config.learning_rate), config.steps)
-    final = icp(best, pair.source, pair.target, config.trim, config.icp_steps)
-    last = icp_step(final, pair.source, pair.target, config.trim)
+    source, target = (
+        (evenly(c, 4) for c in (pair.source, pair.target)) if config.dense else (pair.source, pair.target)
+    )
+    final = icp(best, source, target, config.trim, config.icp_steps)
+    last = icp_step(final, source, target, config.trim)
     still = jnp.linalg.norm((last @ final.inverse()).log()) < STILL
     return score_pose(final, still, loss, pair, config)
 
 
 def score_pose(
-    T: jaxlie.SE3, still: Bool[Array, ""], loss: Callable[[jaxlie.SE3], Array], pair: Pair, config: RegistrationConfig
+    T: jaxlie.SE3,
+    still: Bool[Array, ""],
+    loss: Callable[[jaxlie.SE3], Array],
+    pair: Pair,
+    config: RegistrationConfig,
 ) -> Registration:
     """The record of a pose as it is."""
-    misfit = residual(T, pair.source, pair.target, config.trim)
+    source, target = (
+        (evenly(c, 2) for c in (pair.source, pair.target)) if config.dense else (pair.source, pair.target)
+    )
+    misfit = residual(T, source, target, config.trim)
     converged = still & (misfit < config.converged_rms)
     return Registration(T_target_source=T, loss=loss(T), rms_m=misfit, converged=converged)
 
@@ -261,5 +285,7 @@ def world_pose(
     rotation = Rotation.from_quat(quaternion, scalar_first=True).as_matrix()
     pose = np.eye(4)
     pose[:3, :3] = rotation
-    pose[:3, 3] = np.asarray(T_target_source.translation(), np.float64) + target_origin - rotation @ source_origin
+    pose[:3, 3] = (
+        np.asarray(T_target_source.translation(), np.float64) + target_origin - rotation @ source_origin
+    )
     return pose

@@ -79,7 +79,9 @@ def reconstruct(prior: Prior, scene: LivingScene, config: SceneConfig) -> Living
         objects = fit_objects(prior, objects, [k for k in todo if len(objects[k].observations) > 1], config)
     with timed(timing, "mesh"):
         for k in todo:
-            mesh = extract_mesh(prior, objects[k].embedding, config.meshing, box_half_width(objects[k], config))
+            mesh = extract_mesh(
+                prior, objects[k].embedding, config.meshing, box_half_width(objects[k], config)
+            )
             objects[k] = dataclasses.replace(objects[k], mesh=mesh)
     changes = tuple(changes_between(objects, c.from_scan, c.to_scan, config) for c in scene.changes)
     return dataclasses.replace(scene, objects=tuple(objects), changes=changes, timing_s=timing)

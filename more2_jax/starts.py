@@ -75,7 +75,9 @@ def _mean(cloud: Sampled) -> Float[Array, "3"]:
     return (cloud.mask / jnp.maximum(cloud.mask.sum(), 1)) @ cloud.points
 
 
-HALF_TURNS = np.stack([np.diag(d) for d in ((1.0, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1))]).astype(np.float32)
+HALF_TURNS = np.stack([np.diag(d) for d in ((1.0, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1))]).astype(
+    np.float32
+)
 
 
 def yaw_turns(count: int) -> Float[np.ndarray, "count 3 3"]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 
 import jax
@@ -21,7 +22,10 @@ Found = tuple[int, int, float]  # object, instance, score of the match
 
 
 def match_scan(
-    objects: Sequence[SceneObject], instances: Sequence[Instance], embeddings: Sequence[Embedding], config: SceneConfig
+    objects: Sequence[SceneObject],
+    instances: Sequence[Instance],
+    embeddings: Sequence[Embedding],
+    config: SceneConfig,
 ) -> list[Found]:
     """One assignment of all objects, present or absent just now, to the instances of a scan."""
     old, real_old = stack([o.embedding for o in objects])
@@ -46,12 +50,19 @@ def distances(
 
 
 def misfits(
-    objects: Sequence[SceneObject], instances: Sequence[Instance], old: Embedding, new: Embedding, config: SceneConfig
+    objects: Sequence[SceneObject],
+    instances: Sequence[Instance],
+    old: Embedding,
+    new: Embedding,
+    config: SceneConfig,
 ) -> Float[np.ndarray, "n m"]:
     """`pairwise_misfit` of every instance with every object; 1 at most, so that one bad pair decides nothing else."""
-    source, target = padded([i.points for i in instances]), padded([target_points(o, config) for o in objects])
+    source, target = (
+        padded([i.points for i in instances]),
+        padded([target_points(o, config) for o in objects]),
+    )
     codes = [at_zero(with_origin(e, np.asarray(c.origin))) for e, c in ((new, source), (old, target))]
-    flat = [c.replace(origin=jnp.zeros((len(c.points), 3))) for c in (source, target)]  # type: ignore[attr-defined]
+    flat = [dataclasses.replace(c, origin=jnp.zeros((len(c.points), 3))) for c in (source, target)]
     return np.minimum(pairwise_misfit(*flat, *codes, config.registration, config.upright), 1.0)
 
 
@@ -80,7 +91,9 @@ def register_scan(
     source = padded([instances[i].points for _, i, _ in pairs])
     target = padded([target_points(objects[k], config) for k, _, _ in pairs])
     source_code = with_origin(stack([embeddings[i] for _, i, _ in pairs])[0], np.asarray(source.origin))
-    target_code = with_origin(stack([objects[k].embedding for k, _, _ in pairs])[0], np.asarray(target.origin))
+    target_code = with_origin(
+        stack([objects[k].embedding for k, _, _ in pairs])[0], np.asarray(target.origin)
+    )
     result = register(prior, source, target, source_code, target_code, config.registration, config.upright)
     result = jax.device_get(result)
     limit = _largest_residual(target, config)
@@ -98,7 +111,13 @@ def _largest_residual(target: PointCloud, config: SceneConfig) -> Float[np.ndarr
 
 
 def _observation(
-    result: Registration, n: int, source: PointCloud, target: PointCloud, scan: int, instance: int, score: float
+    result: Registration,
+    n: int,
+    source: PointCloud,
+    target: PointCloud,
+    scan: int,
+    instance: int,
+    score: float,
 ) -> Observation:
     """Pair `n` of a registration, in the scans' own frames."""
     T = jax.tree.map(lambda x: x[n], result.T_target_source)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import TypeVar, dataclass_transform
@@ -51,12 +52,12 @@ class Embedding:
 
 def scale_embedding(e: Embedding, factor: Float[Array, ""]) -> Embedding:
     """The embedding of the same object in other units of length."""
-    return e.replace(scale=e.scale * factor, center=e.center * factor)  # type: ignore[attr-defined]
+    return dataclasses.replace(e, scale=e.scale * factor, center=e.center * factor)
 
 
 def move_embedding(e: Embedding, T_b_a: jaxlie.SE3) -> Embedding:
     """The embedding of a moved object: Φ is equivariant, so nothing is encoded again. One object; local frames."""
-    return e.replace(eqv=T_b_a.rotation().as_matrix() @ e.eqv, center=T_b_a @ e.center)  # type: ignore[attr-defined]
+    return dataclasses.replace(e, eqv=T_b_a.rotation().as_matrix() @ e.eqv, center=T_b_a @ e.center)
 
 
 @pytree

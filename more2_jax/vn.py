@@ -96,9 +96,7 @@ def nearest_features(
     return index, jnp.isfinite(nearest)
 
 
-def masked_mean(
-    x: Float[Array, "n *f"], mask: Bool[Array, "n"], axis: int = 0
-) -> Float[Array, "*f"]:
+def masked_mean(x: Float[Array, "n *f"], mask: Bool[Array, "n"], axis: int = 0) -> Float[Array, "*f"]:
     """Mean over the rows where `mask` holds."""
     weight = mask.astype(x.dtype) / jnp.maximum(mask.sum(), 1)
     return jnp.tensordot(weight, x, axes=(0, axis))

@@ -63,7 +63,7 @@ def main(config: Path, shards: Path, out: Path, minutes: float = math.inf, name:
         if (latest := manager.latest_step()) is not None:
             state = manager.restore(latest, args=ocp.args.StandardRestore(state))
         state = train_until(deadline, state, prior, run.training, train, val, out, manager)
-    save_prior(prior.replace(params=state.average), out / "weights.npz")  # type: ignore[attr-defined]
+    save_prior(dataclasses.replace(prior, params=state.average), out / "weights.npz")
 
 
 def calibrated(model: PriorConfig, training: TrainingConfig, shapes: Shapes) -> PriorConfig:
@@ -106,7 +106,7 @@ def training_step(
     sample = sample_batch(sample_key, shapes, index, config, prior.config.encoder.points)
 
     def loss(params: dict[str, Any]) -> tuple[Array, dict[str, Array]]:
-        return total_loss(prior.replace(params=params), sample, config, dropout_key)  # type: ignore[attr-defined]
+        return total_loss(dataclasses.replace(prior, params=params), sample, config, dropout_key)
 
     gradient, terms = jax.grad(loss, has_aux=True)(state.params)
     updates, opt_state = optimiser(config).update(gradient, state.optimiser, state.params)
@@ -150,10 +150,16 @@ def train_until(
 
 
 def report(
-    out: Path, state: TrainingState, prior: Prior, config: TrainingConfig, val: Shapes, mean: dict[str, float], s: float
+    out: Path,
+    state: TrainingState,
+    prior: Prior,
+    config: TrainingConfig,
+    val: Shapes,
+    mean: dict[str, float],
+    s: float,
 ) -> None:
     """Appends training means and validation scores to log.jsonl and writes the averaged weights."""
-    averaged = prior.replace(params=state.average)  # type: ignore[attr-defined]
+    averaged = dataclasses.replace(prior, params=state.average)
     scores = validate(averaged, val, config)
     line = {"step": int(state.step), "seconds": round(s, 1), "train": mean, "val": scores}
     with (out / "log.jsonl").open("a") as log:

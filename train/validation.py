@@ -32,7 +32,9 @@ def validate(prior: Prior, shapes: Shapes, config: TrainingConfig) -> dict[str, 
     return {k: float(jnp.mean(jnp.concatenate([r[k] for r in rows]))) for k in rows[0]}
 
 
-def _scores(prior: Prior, shapes: Shapes, index: Array, seed: int, config: TrainingConfig) -> dict[str, Array]:
+def _scores(
+    prior: Prior, shapes: Shapes, index: Array, seed: int, config: TrainingConfig
+) -> dict[str, Array]:
     key = jax.random.fold_in(jax.random.key(1), seed)
     sample = jax.jit(sample_batch, static_argnames=("config", "points"))(
         key, shapes, index, config, prior.config.encoder.points

@@ -55,7 +55,7 @@ def read_ply(path: Path) -> PlyCloud:
 
 def _vertices(path: Path) -> np.ndarray:
     try:
-        elements = PlyData.read(str(path), mmap=False)
+        elements = PlyData.read(str(path), mmap=False)  # pyright: ignore[reportArgumentType]
     except (PlyParseError, ValueError, UnicodeDecodeError, EOFError, OverflowError, MemoryError) as error:
         reason = " ".join(str(error).split()) or type(error).__name__
         raise ValueError(f"{path}: truncated or damaged PLY ({reason}); needed a complete file") from error
