@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
 from rich.console import Console
@@ -35,7 +36,7 @@ def main(
     prior: str = "small",
     scenes: int = 5,
     objects: int = 7,
-    regime: str = "sparse",
+    regime: Literal["paper", "sparse"] = "sparse",
     seed: int = 0,
     upright: bool = True,
 ) -> None:
@@ -61,10 +62,10 @@ def main(
             config,
             FlyingConfig(2, regime, static=1, removed=1, added=1, free=not upright),
             k,
-        )  # type: ignore[arg-type]
-        for k in track([(seed, n, objects) for n in range(scenes)], description="rooms", disable=None)
+        )
+        for k in track([(seed, n, objects) for n in range(scenes)], description="rooms")
     ]
-    results = {name: summary([row[name] for row in rows if row[name] is not None]) for name in rows[0]}
+    results = {name: summary([row[name] for row in rows]) for name in rows[0]}
     out.mkdir(parents=True, exist_ok=True)
     (out / "results.json").write_text(
         json.dumps({"prior": weights.name, "regime": regime, **results}, indent=1)
@@ -145,8 +146,9 @@ def extents_recall(room: FlyingScene) -> float:
     return float(np.mean([(t[0], t[1]) in pairs for t in true]))
 
 
-def summary(values: list[float]) -> dict[str, object]:
-    """Mean, interval and count."""
+def summary(rows: list[float | None]) -> dict[str, Any]:
+    """Mean, interval and count over the rooms in which the figure is defined."""
+    values = [value for value in rows if value is not None]
     return {"mean": float(np.mean(values)), "ci95": bootstrap_ci95(values), "count": len(values)}
 
 

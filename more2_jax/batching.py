@@ -19,7 +19,7 @@ def bucket(count: int, smallest: int = 1) -> int:
     return max(smallest, 1 << max(count - 1, 0).bit_length())
 
 
-def pad_clouds(clouds: Sequence[Float[np.ndarray, "n 3"]], size: int | None = None) -> PointCloud:
+def pad_clouds(clouds: Sequence[Float[np.ndarray, "_ 3"]], size: int | None = None) -> PointCloud:
     """Batches ragged clouds: (objects, bucket, 3), centred on each cloud's own `origin` (float64).
 
     The point farthest from the mean comes first: farthest-point sampling starts there, so that the order of

@@ -108,6 +108,9 @@ class MeshingConfig:
 
     coarse: int = 32  # cells a side of the first grid
     resolution: int = 64  # of the last: `coarse`, doubled once or more
+    level: Literal["zero", "observed"] = (
+        "zero"  # which level is the surface: 0, or the field's median at the points
+    )
     half_width: float = 0.65  # of the query box, canonical units; objects are turned in it, so more than 0.55
 
 
@@ -179,7 +182,7 @@ def preset(name: str, *, upright: bool = False) -> SceneConfig:
                 max_size_ratio=1.8,
                 misfit_weight=5.0,
                 motion_weight=0.01,
-                reject_residual=0.06,
+                reject_residual=0.05,
             ),
             registration=RegistrationConfig(
                 points=256,
@@ -191,10 +194,10 @@ def preset(name: str, *, upright: bool = False) -> SceneConfig:
                 keep_starts=3,
                 steps=25,
                 learning_rate=0.01,
-                icp_steps=8,
+                icp_steps=12,
                 trim=0.7,
             ),
-            meshing=MeshingConfig(coarse=16, resolution=64),
+            meshing=MeshingConfig(coarse=16, resolution=64, level="observed"),
             joint=JointConfig(points=128, start="accumulated", steps=40, eqv_learning_rate=1e-3),
         )
     raise ValueError(f"preset {name!r}; needed 'paper' or 'robust'")

@@ -64,7 +64,9 @@ class LinearBlock(nn.Module):
     features: int
 
     @nn.compact
-    def __call__(self, source: Features, mask: Bool[Array, "m"], query: Features) -> Features:
+    def __call__(
+        self, source: Float[Array, "m 3 i"], mask: Bool[Array, "m"], query: Float[Array, "n 3 i"]
+    ) -> Features:
         index, real = nearest_features(query, source, mask, self.config.neighbours)
         edges = EdgeVNLA(self.features, self.config.leak, name="value")(source, query, index)
         return mean_over_neighbours(edges, real)
@@ -78,7 +80,11 @@ class AttentionBlock(nn.Module):
 
     @nn.compact
     def __call__(
-        self, source: Features, mask: Bool[Array, "m"], query: Features, query_mask: Bool[Array, "n"]
+        self,
+        source: Float[Array, "m 3 i"],
+        mask: Bool[Array, "m"],
+        query: Float[Array, "n 3 i"],
+        query_mask: Bool[Array, "n"],
     ) -> Features:
         c = self.config
         index, real = nearest_features(query, source, mask, c.neighbours)
@@ -146,7 +152,7 @@ class Encoder(nn.Module):
 
     def blocks(
         self, points: Float[Array, "n 3"], mask: Bool[Array, "n"]
-    ) -> tuple[Features, Bool[Array, "m"]]:
+    ) -> tuple[Float[Array, "m 3 c"], Bool[Array, "m"]]:
         """All VN blocks; thinning takes the first rows."""
         c = self.config
         thinning = dict(zip(c.downsample_blocks, c.downsample_factors, strict=True))

@@ -17,12 +17,12 @@ from more2_jax.types import Embedding, PointCloud
 SMALLEST_BATCH = 8  # scenes of up to so many objects share their compiled programs
 
 
-def padded(clouds: Sequence[Float[np.ndarray, "n 3"]], smallest: int = SMALLEST_BATCH) -> PointCloud:
+def padded(clouds: Sequence[Float[np.ndarray, "_ 3"]], smallest: int = SMALLEST_BATCH) -> PointCloud:
     """Ragged clouds as one batch of one shape for all scenes: (bucket, `MAX_POINTS`, 3). Fillers repeat the first."""
     return pad_batch(pad_clouds(clouds, MAX_POINTS), bucket(len(clouds), smallest))
 
 
-def embed(prior: Prior, clouds: Sequence[Float[np.ndarray, "n 3"]]) -> list[Embedding]:
+def embed(prior: Prior, clouds: Sequence[Float[np.ndarray, "_ 3"]]) -> list[Embedding]:
     """One embedding per cloud, in one call."""
     return unstack(encode(prior, padded(clouds)), len(clouds))
 

@@ -22,12 +22,17 @@ _values = jax.jit(sdf_one)
 
 
 def extract_mesh(
-    prior: Prior, embedding: Embedding, config: MeshingConfig, half_width: float | None = None
+    prior: Prior,
+    embedding: Embedding,
+    config: MeshingConfig,
+    half_width: float | None = None,
+    level: float = 0.0,
 ) -> Mesh | None:
-    """The zero level set of one object's field, metres in its scan's frame, always closed.
+    """A level set of one object's field, by default 0; metres in its scan's frame, always closed.
 
-    `half_width` (canonical units) is half the edge of the query box. Returns None when the field has no zero in
-    the box: there is no surface to show. Raises ValueError unless `resolution` is `coarse` doubled some times.
+    `half_width` (canonical units) is half the edge of the query box. Returns None when the field stays above
+    `level` in the box: there is no surface to show. Raises ValueError unless `resolution` is `coarse` doubled
+    some times.
     """
     doublings = np.log2(config.resolution / config.coarse)
     if doublings < 0 or doublings != int(doublings):
@@ -35,12 +40,20 @@ def extract_mesh(
             f"resolution {config.resolution} from coarse {config.coarse}; needed a power of two times it"
         )
     half = half_width or config.half_width
-    values = _evaluate(prior, embedding, _grid(config.coarse, half)).reshape([config.coarse + 1] * 3)
+    values = _evaluate(prior, embedding, _grid(config.coarse, half)).reshape([config.coarse + 1] * 3) - level
     while len(values) - 1 < config.resolution:
-        values = _refine(prior, embedding, values, half)
+        values = _refine(prior, embedding, values, half, level)
     if not (values < 0).any():
         return None
     return _surface(values, embedding, 2 * half / (len(values) - 1), half)
+
+
+def observed_level(prior: Prior, embedding: Embedding, points: Float[np.ndarray, "n 3"]) -> float:
+    """The field's median at points (scan's frame) known to lie on the surface, canonical units; 0.1 at most."""
+    some = points[np.linspace(0, len(points) - 1, min(len(points), CHUNK)).astype(int)]
+    center = np.asarray(embedding.center, np.float64) + np.asarray(embedding.origin)
+    values = _evaluate(prior, embedding, (some - center) / float(embedding.scale))
+    return float(np.clip(np.median(values), -0.1, 0.1))
 
 
 def _grid(cells: int, half: float) -> Float[np.ndarray, "p 3"]:
@@ -61,7 +74,7 @@ def _evaluate(
 
 
 def _refine(
-    prior: Prior, embedding: Embedding, coarse: Float[np.ndarray, "n n n"], half: float
+    prior: Prior, embedding: Embedding, coarse: Float[np.ndarray, "n n n"], half: float, level: float
 ) -> Float[np.ndarray, "m m m"]:
     """The grid with half the step: evaluated near the surface, interpolated elsewhere."""
     cells = 2 * (len(coarse) - 1)
@@ -72,7 +85,7 @@ def _refine(
     for step in itertools.product(range(3), repeat=3):
         fine[tuple((corners + step).T)] = True
     fine[::2, ::2, ::2] = False  # known from the coarse grid
-    values[fine] = _evaluate(prior, embedding, np.argwhere(fine) * (2 * half / cells) - half)
+    values[fine] = _evaluate(prior, embedding, np.argwhere(fine) * (2 * half / cells) - half) - level
     return values
 
 

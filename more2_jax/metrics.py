@@ -10,7 +10,8 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
-Points = Float[np.ndarray, "n 3"]
+Points = Float[np.ndarray, "_ 3"]  # clouds of one call differ in size
+Errors = Sequence[float] | Float[np.ndarray, " n"]
 Matrix3 = Float[np.ndarray, "3 3"]
 Pose = Float[np.ndarray, "4 4"]
 
@@ -47,7 +48,7 @@ def translation_error(t: Float[np.ndarray, "3"], t_true: Float[np.ndarray, "3"])
     return float(np.linalg.norm(np.asarray(t) - t_true))
 
 
-def recall(errors: Sequence[float], threshold: float) -> float:
+def recall(errors: Errors, threshold: float) -> float:
     """Share of errors below a threshold; a failure is infinite or NaN, and counts. NaN of nothing."""
     values = np.asarray(errors, float)
     return float(np.mean(values < threshold)) if len(values) else float("nan")
@@ -58,14 +59,15 @@ def instance_recall(
 ) -> float:
     """Correct matches over true matches; −1 means no partner. NaN when nothing has a partner.
 
-    `same[j]` is equal for targets that are identical copies: each may stand in for the other.
+    `same[j]` is equal for targets that are identical copies: each may stand in for the other, but only
+    once: a target that several sources claim is right for one of them.
     """
     has = truth >= 0
     right = has & (predicted >= 0) & (same[np.maximum(predicted, 0)] == same[np.maximum(truth, 0)])
-    return float(right.sum() / has.sum()) if has.any() else float("nan")
+    return float(len(np.unique(predicted[right])) / has.sum()) if has.any() else float("nan")
 
 
-def scene_recall(recalls: Sequence[float], share: float) -> float:
+def scene_recall(recalls: Errors, share: float) -> float:
     """Share of scan pairs whose own instance recall is at least `share`."""
     return float(np.mean(np.asarray(recalls) >= share)) if len(recalls) else float("nan")
 
@@ -138,13 +140,13 @@ def f1(predicted: set[str], truth: set[str]) -> float:
     return 2 * len(predicted & truth) / (len(predicted) + len(truth))
 
 
-def ecdf(errors: Sequence[float]) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+def ecdf(errors: Errors) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
     """Sorted errors and the share at or below each."""
     values = np.sort(np.asarray(errors, float))
     return values, np.arange(1, len(values) + 1) / max(len(values), 1)
 
 
-def bootstrap_ci95(values: Sequence[float], seed: int = 0, draws: int = 2000) -> tuple[float, float]:
+def bootstrap_ci95(values: Errors, seed: int = 0, draws: int = 2000) -> tuple[float, float]:
     """95 % interval of the mean by resampling; NaN of nothing."""
     data = np.asarray(values, float)
     if not len(data):

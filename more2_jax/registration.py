@@ -36,10 +36,8 @@ from more2_jax.types import Embedding, PointCloud, Registration, scale_embedding
 
 STILL = 1e-2  # a last ICP step below this (radians, and shares of the radius) has settled
 APART_DEG = 25.0  # refined poses differ by at least this
-EQUAL_RATIO, EQUAL_OFFSET = (
-    1.03,
-    0.001,
-)  # residuals this close say the same (the offset in shares of the radius)
+# How much worse "it did not move" may fit and still be chosen (the offset in shares of the radius).
+STAYED_RATIO, STAYED_OFFSET = 1.1, 0.001
 
 
 def register(
@@ -108,7 +106,7 @@ def register_one(prior: Prior, pair: Pair, config: RegistrationConfig, upright: 
     refined = jax.vmap(lambda T: refine(prior, T, pair, config))(starts)
     if config.identity_start:
         refined = with_stayed(prior, refined, pair, config)
-    best = choose(refined, pair, config)
+    best = choose(refined, config)
     T = best.T_target_source
     T = jaxlie.SE3.from_rotation_and_translation(T.rotation(), T.translation() * radius)
     return dataclasses.replace(best, T_target_source=T, rms_m=best.rms_m * radius)
@@ -256,25 +254,17 @@ def with_stayed(prior: Prior, refined: Registration, pair: Pair, config: Registr
     return jax.tree.map(lambda many, *one: jnp.concatenate([many, jnp.stack(one)]), refined, nearby, exact)
 
 
-def choose(refined: Registration, pair: Pair, config: RegistrationConfig) -> Registration:
-    """The pose with the lowest residual; with `identity_start`, the least motion among equals.
+def choose(refined: Registration, config: RegistrationConfig) -> Registration:
+    """The pose with the lowest residual; with `identity_start`, "it did not move" (the last) if nearly as good.
 
-    A symmetric object has many poses of equal residual; that it stayed is the simplest of them.
+    A symmetric object has many poses of equal residual, and a half-seen one a few of slightly less than the truth;
+    that it stayed is the simplest explanation.
     """
     cost = refined.rms_m
     if config.identity_start:
-        equal = cost <= cost.min() * EQUAL_RATIO + EQUAL_OFFSET
-        cost = jnp.where(equal, jax.vmap(lambda T: motion(T, pair))(refined.T_target_source), jnp.inf)
+        cost = cost.at[-1].set((cost[-1] - STAYED_OFFSET) / STAYED_RATIO)
     best = jnp.argmin(cost)
     return jax.tree.map(lambda x: x[best], refined)
-
-
-def motion(T_target_source: jaxlie.SE3, pair: Pair) -> Float[Array, ""]:
-    """Root mean square displacement of the source in the room, if both scans share a frame."""
-    points, mask = pair.source.points, pair.source.mask
-    displacement = T_target_source @ points - (points + pair.offset)
-    squared = jnp.where(mask, jnp.sum(displacement**2, axis=-1), 0.0)
-    return jnp.sqrt(squared.sum() / jnp.maximum(mask.sum(), 1))
 
 
 def world_pose(

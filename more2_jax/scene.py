@@ -12,11 +12,11 @@ import numpy as np
 from more2_jax.config import SceneConfig
 from more2_jax.encoding import embed
 from more2_jax.fitting import embed_accumulated, fit_objects
-from more2_jax.meshing import extract_mesh
+from more2_jax.meshing import extract_mesh, observed_level
 from more2_jax.objects import changes_between, new_object, seen_again
 from more2_jax.prior import Prior
 from more2_jax.tracking import match_scan, register_scan
-from more2_jax.types import Instance, LivingScene, Scan, ScanRecord, SceneObject, Skipped
+from more2_jax.types import Instance, LivingScene, Mesh, Scan, ScanRecord, SceneObject, Skipped
 
 
 def start_scene(prior: Prior, scan: Scan, config: SceneConfig) -> LivingScene:
@@ -79,12 +79,18 @@ def reconstruct(prior: Prior, scene: LivingScene, config: SceneConfig) -> Living
         objects = fit_objects(prior, objects, [k for k in todo if len(objects[k].observations) > 1], config)
     with timed(timing, "mesh"):
         for k in todo:
-            mesh = extract_mesh(
-                prior, objects[k].embedding, config.meshing, box_half_width(objects[k], config)
-            )
-            objects[k] = dataclasses.replace(objects[k], mesh=mesh)
+            objects[k] = dataclasses.replace(objects[k], mesh=mesh_of(prior, objects[k], config))
     changes = tuple(changes_between(objects, c.from_scan, c.to_scan, config) for c in scene.changes)
     return dataclasses.replace(scene, objects=tuple(objects), changes=changes, timing_s=timing)
+
+
+def mesh_of(prior: Prior, o: SceneObject, config: SceneConfig) -> Mesh | None:
+    """The object's mesh, in a box that holds all that was seen of it.
+
+    `level` "observed": seen points lie on the surface, so the field's median there is its bias, and is taken off.
+    """
+    level = observed_level(prior, o.embedding, o.points) if config.meshing.level == "observed" else 0.0
+    return extract_mesh(prior, o.embedding, config.meshing, box_half_width(o, config), level)
 
 
 def box_half_width(o: SceneObject, config: SceneConfig) -> float:

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
+SPARE = 8  # more candidates than neighbours asked for, before exact distances decide
 TINY = 1e-30  # guards squared norms: far below any feature, so it changes none (1e-12 would)
 
 # Unit gain keeps features near unit size through the blocks; smaller gains let them vanish.
@@ -92,8 +93,12 @@ def nearest_features(
     product = jnp.matmul(a, b.T, precision="highest")
     # |a|² is the same for a whole row, so it does not change the order.
     distance = jnp.where(source_mask, jnp.sum(b * b, axis=-1) - 2 * product, jnp.inf)
-    nearest, index = jax.lax.top_k(-distance, k)
-    return index, jnp.isfinite(nearest)
+    rough, candidate = jax.lax.top_k(-distance, min(k + SPARE, len(b)))
+    # The expansion cancels, and a swapped k-th neighbour moves the code by percents: the last word has the
+    # sum of squared differences.
+    exact = jnp.sum((a[:, None] - b[candidate]) ** 2, axis=-1)
+    nearest, rank = jax.lax.top_k(jnp.where(jnp.isfinite(rough), -exact, -jnp.inf), k)
+    return jnp.take_along_axis(candidate, rank, axis=1), jnp.isfinite(nearest)
 
 
 def masked_mean(x: Float[Array, "n *f"], mask: Bool[Array, "n"], axis: int = 0) -> Float[Array, "*f"]:
