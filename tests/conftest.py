@@ -1,0 +1,38 @@
+"""JAX on the CPU in full precision, shapes of every signature checked, and the smallest prior there is."""
+
+import os
+from pathlib import Path
+
+os.environ["JAX_PLATFORMS"] = "cpu"
+
+import jax
+import jaxtyping
+import pytest
+from jaxtyping import install_import_hook
+
+# Before anything of more2_jax is imported: every call's shapes and dtypes are held against its annotations. Not in
+# `types`, whose records pass through JAX's transformations, nor where values of any kind are taken and refused.
+CHECKED = (
+    "batching decoder descent encoder encoding geometry joint losses matching meshing metrics objects prior "
+    "registration starts tracking vn"
+)
+install_import_hook([f"more2_jax.{name}" for name in CHECKED.split()], "beartype.beartype")
+jax.config.update("jax_default_matmul_precision", "highest")
+
+ROOT = Path(__file__).parents[1]
+
+
+@pytest.fixture(scope="session")
+def tiny_prior():
+    """Random weights in the smallest configuration."""
+    from more2_jax.config import TrainingRun, load_config
+    from more2_jax.prior import init_prior
+
+    config = load_config(ROOT / "configs" / "tiny.yaml", TrainingRun).model
+    return init_prior(config, jax.random.key(0), "tiny")
+
+
+@pytest.fixture
+def unchecked(monkeypatch):
+    """Switches the check of annotations off, to see a public door refuse what does not fit by itself."""
+    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)

@@ -1,0 +1,111 @@
+"""Settings: strict YAML, presets, round trips."""
+
+import dataclasses
+from pathlib import Path
+
+import pytest
+
+from more2_jax.config import (
+    EncoderConfig,
+    MatchingConfig,
+    PriorConfig,
+    SceneConfig,
+    TrainingRun,
+    from_dict,
+    load_config,
+    preset,
+    to_yaml,
+)
+
+ROOT = Path(__file__).parents[1]
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "configs").glob("*.yaml")), ids=lambda p: p.stem)
+def test_shipped_configurations_load_and_round_trip(path, tmp_path):
+    run = load_config(path, TrainingRun)
+    copy = tmp_path / "copy.yaml"
+    copy.write_text(to_yaml(run))
+    assert load_config(copy, TrainingRun) == run
+
+
+@pytest.mark.parametrize("upright", [False, True])
+@pytest.mark.parametrize("name", ["paper", "robust"])
+def test_presets_round_trip(name, upright, tmp_path):
+    config = preset(name, upright=upright)
+    assert (config.preset, config.upright) == (name, upright)
+    path = tmp_path / "scene.yaml"
+    path.write_text(to_yaml(config))
+    assert load_config(path, SceneConfig) == config
+
+
+def test_paper_is_the_paper():
+    paper = preset("paper")
+    assert paper.matching == MatchingConfig(score="both", assignment="hungarian")
+    assert paper.registration.starts == "embedding"
+    assert (paper.registration.steps, paper.registration.trim) == (200, 1.0)
+    assert (paper.joint.start, paper.joint.steps) == ("best", 200)
+    assert paper.matching.misfit_weight == paper.matching.reject_residual == 0
+    assert not paper.accumulate_target
+
+
+def test_base_has_the_published_widths():
+    assert load_config(ROOT / "configs" / "base.yaml", TrainingRun).model.encoder == EncoderConfig()
+
+
+def test_yaw_starts_only_when_upright():
+    assert preset("robust").registration.yaw_starts == 0
+    assert preset("robust", upright=True).registration.yaw_starts > 0
+
+
+def test_unknown_preset_names_the_known():
+    with pytest.raises(ValueError, match="'fast'; needed 'paper' or 'robust'"):
+        preset("fast")
+
+
+@pytest.mark.parametrize(
+    ("values", "complaint"),
+    [
+        ({"encoder": {"width": 3}}, r"encoder: unknown width; known are .*widths"),
+        ({"encoder": {"neighbours": "many"}}, "encoder.neighbours: got 'many', needed int"),
+        ({"encoder": {"neighbours": 1.5}}, "encoder.neighbours: got 1.5, needed int"),
+        ({"encoder": {"neighbours": True}}, "encoder.neighbours: got True, needed int"),
+        ({"encoder": {"widths": 16}}, "encoder.widths: got 16, needed a list"),
+        ({"encoder": {"widths": [16, "x"]}}, r"encoder.widths\[1\]: got 'x', needed int"),
+        ({"encoder": [1]}, r"encoder: got \[1\], needed a mapping"),
+        ({"eqv_gain": None}, "eqv_gain: got None, needed float"),
+        ({"eqv_gain": True}, "eqv_gain: got True, needed float"),
+    ],
+)
+def test_wrong_values_are_named(values, complaint):
+    with pytest.raises(ValueError, match=complaint):
+        from_dict(PriorConfig, values)
+
+
+def test_choices_are_listed():
+    with pytest.raises(ValueError, match="score: got 'all', needed one of 'inv', 'eqv', 'both'"):
+        from_dict(MatchingConfig, {"score": "all"})
+
+
+def test_whole_numbers_are_floats_and_missing_keys_keep_their_defaults():
+    config = from_dict(PriorConfig, {"eqv_gain": 3})
+    assert isinstance(config.eqv_gain, float)
+    assert config == dataclasses.replace(PriorConfig(), eqv_gain=3.0)
+
+
+@pytest.mark.parametrize("text", ["", "# nothing but a remark\n"])
+def test_an_empty_file_is_all_defaults(text, tmp_path):
+    path = tmp_path / "empty.yaml"
+    path.write_text(text)
+    assert load_config(path, TrainingRun) == TrainingRun()
+
+
+def test_a_complaint_names_the_file(tmp_path):
+    path = tmp_path / "mine.yaml"
+    path.write_text("modle: {}")
+    with pytest.raises(ValueError, match=r"mine\.yaml: unknown modle; known are model, training"):
+        load_config(path, TrainingRun)
+
+
+def test_settings_cannot_be_changed():
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        preset("robust").min_points = 3
