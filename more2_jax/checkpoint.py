@@ -217,16 +217,13 @@ def _load(archive: zipfile.ZipFile, folder: str, tensor: StoredTensor, order: st
         raise ValueError(
             f"storage {tensor.key} of {record.file_size} bytes does not hold a tensor of {tensor.shape}"
         )
-    raw = np.frombuffer(archive.read(record), _ordered(tensor.dtype, order))
+    bits = np.frombuffer(archive.read(record), f"{order}u{tensor.dtype.itemsize}")
+    raw = bits.astype(bits.dtype.newbyteorder("=")).view(tensor.dtype)
     if not count:
         return np.zeros(tensor.shape, tensor.dtype)
     strides = [s * raw.itemsize for s in tensor.strides]
     view = np.lib.stride_tricks.as_strided(raw[tensor.offset :], tensor.shape, strides, writeable=False)
-    return np.array(view.astype(tensor.dtype))
-
-
-def _ordered(dtype: np.dtype[Any], order: str) -> np.dtype[Any]:
-    return dtype.newbyteorder(">" if order == ">" else "<") if dtype.kind != "V" else dtype
+    return view.copy()
 
 
 # --- parity -------------------------------------------------------------------------------------------------

@@ -76,7 +76,9 @@ def attention(weights: Weights, i: int, query: np.ndarray, graph: np.ndarray) ->
         share = np.exp(logit) / np.exp(logit).sum(axis=1, keepdims=True)
         mixed[:, head] = (share[..., None, None] * v[:, :, head]).sum(axis=1)
     context = np.broadcast_to(mixed.mean(axis=0), mixed.shape)
-    return vnla(weights, f"{ENCODER}global_conv_list.{i - FIRST_ATTENTION}", np.concatenate([mixed, context], axis=1))
+    return vnla(
+        weights, f"{ENCODER}global_conv_list.{i - FIRST_ATTENTION}", np.concatenate([mixed, context], axis=1)
+    )
 
 
 def encode(weights: Weights, points: np.ndarray) -> dict[str, np.ndarray]:
@@ -86,7 +88,9 @@ def encode(weights: Weights, points: np.ndarray) -> dict[str, np.ndarray]:
     xyz = points - mean
     features = xyz[:, None]
     for i in range(sum(k.startswith(f"{ENCODER}V_list") for k in weights) // 2):
-        kept = farthest_from_first(xyz, len(xyz) // THINNING.get(i, 1)) if i in THINNING else np.arange(len(xyz))
+        kept = (
+            farthest_from_first(xyz, len(xyz) // THINNING.get(i, 1)) if i in THINNING else np.arange(len(xyz))
+        )
         query = features[kept]
         graph = graph_feature(query, features, NEIGHBOURS, first=i == 0)
         if i < FIRST_ATTENTION:
@@ -122,7 +126,9 @@ def decode(weights: Weights, code: Mapping[str, np.ndarray], points: np.ndarray,
         h = np.concatenate([h, inputs], axis=1) if i == skip else h
         v = weights[f"{DECODER}lin{i}.weight_v"].astype(np.float64)
         g = weights[f"{DECODER}lin{i}.weight_g"].reshape(-1, 1)
-        h = np.maximum(h @ (g * v / np.linalg.norm(v, axis=1, keepdims=True)).T + weights[f"{DECODER}lin{i}.bias"], 0)
+        h = np.maximum(
+            h @ (g * v / np.linalg.norm(v, axis=1, keepdims=True)).T + weights[f"{DECODER}lin{i}.bias"], 0
+        )
     last = weights[f"{DECODER}lin{layers}.weight"].astype(np.float64)
     return np.tanh(h @ last[0] + weights[f"{DECODER}lin{layers}.bias"][0])
 
@@ -130,11 +136,15 @@ def decode(weights: Weights, code: Mapping[str, np.ndarray], points: np.ndarray,
 def outputs(weights: Weights, points: np.ndarray, queries: np.ndarray) -> dict[str, np.ndarray]:
     """All five outputs for a batch of clouds and queries, stacked."""
     codes = [encode(weights, cloud) for cloud in points]
-    sdf = [decode(weights, code, query.astype(np.float64)) for code, query in zip(codes, queries, strict=True)]
+    sdf = [
+        decode(weights, code, query.astype(np.float64)) for code, query in zip(codes, queries, strict=True)
+    ]
     return {name: np.stack([code[name] for code in codes]) for name in codes[0]} | {"sdf": np.stack(sdf)}
 
 
-def random_weights(widths: tuple[int, ...], code: int, hidden: int, seed: int, layers: int = 8) -> dict[str, np.ndarray]:
+def random_weights(
+    widths: tuple[int, ...], code: int, hidden: int, seed: int, layers: int = 8
+) -> dict[str, np.ndarray]:
     """Random weights of unit gain by the published names; the scale in F_s and F_c is large for them."""
     rng = np.random.default_rng(seed)
     shapes = _encoder_shapes(widths, code)

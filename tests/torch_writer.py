@@ -57,7 +57,12 @@ def mapping(entries: Mapping[str, bytes]) -> bytes:
 
 
 def write_raw(
-    path: Path, body: bytes, storages: Mapping[str, bytes], *, root: str = "archive/", order: str | None = "little"
+    path: Path,
+    body: bytes,
+    storages: Mapping[str, bytes],
+    *,
+    root: str = "archive/",
+    order: str | None = "little",
 ) -> Path:
     """A checkpoint whose pickle is `body` (opcodes without protocol and stop)."""
     with zipfile.ZipFile(path, "w") as archive:
@@ -69,12 +74,16 @@ def write_raw(
     return path
 
 
-def save(path: Path, weights: Mapping[str, np.ndarray], *, order: str = "little", extra: bytes | None = None) -> Path:
+def save(
+    path: Path, weights: Mapping[str, np.ndarray], *, order: str = "little", extra: bytes | None = None
+) -> Path:
     """A checkpoint of contiguous tensors under `model_state_dict`; `extra` is a pickled value beside it."""
     entries, storages = {}, {}
     for i, (key, array) in enumerate(weights.items()):
         strides = tuple(s // array.itemsize for s in np.ascontiguousarray(array).strides)
-        entries[key] = tensor(str(i), array.dtype.name, array.size, 0, array.shape, strides if array.ndim else ())
+        entries[key] = tensor(
+            str(i), array.dtype.name, array.size, 0, array.shape, strides if array.ndim else ()
+        )
         swap = order == "big" and array.itemsize > 1
         storages[str(i)] = (array.byteswap() if swap else array).tobytes()
     content = {"model_state_dict": mapping(entries)} | ({"extra": extra} if extra else {})
