@@ -70,10 +70,15 @@ def main(
     (out / "results.json").write_text(
         json.dumps({"prior": weights.name, "regime": regime, **results}, indent=1)
     )
+    Console().print(results_table(results))
+
+
+def results_table(results: dict[str, dict[str, Any]]) -> Table:
+    """Every figure with its interval."""
     table = Table("figure", "mean", "95 % interval", "rooms")
     for name, r in results.items():
         table.add_row(name, f"{r['mean']:.3f}", f"{r['ci95'][0]:.3f} … {r['ci95'][1]:.3f}", str(r["count"]))
-    Console().print(table)
+    return table
 
 
 def one_room(
