@@ -50,6 +50,7 @@ class Sampled:
 
 def sample(points: Float[Array, "n 3"], mask: Bool[Array, " n"], count: int, dense: bool) -> Sampled:
     """`count` farthest points of a cloud, beside all of it, or (`dense` False) beside nothing more."""
+    points = jnp.where(mask[:, None], points, 0.0)  # whatever stands in masked rows, even NaN, goes no further
     sparse, sparse_mask = farthest_points(points, mask, count)
     if dense:
         return Sampled(points=sparse, mask=sparse_mask, dense=points, dense_mask=mask)

@@ -103,7 +103,7 @@ def near_surface(values: Float[np.ndarray, "n n n"], cell: float) -> Bool[np.nda
 def _surface(values: Float[np.ndarray, "m m m"], embedding: Embedding, step: float, half: float) -> Mesh:
     # A ring of outside around the box closes surfaces that reach its border.
     padded = np.pad(values, 1, constant_values=max(float(values.max()), step))
-    vertices, faces, _, _ = marching_cubes(padded, 0.0, gradient_direction="ascent")
+    vertices, faces, _, _ = marching_cubes(padded, 0.0, gradient_direction="descent")
     canonical = (vertices - 1) * step - half
     origin = np.asarray(embedding.origin, np.float64)
     placed = canonical * float(embedding.scale) + np.asarray(embedding.center, np.float64) + origin

@@ -104,7 +104,9 @@ def _sdf_many(prior: Prior, embedding: Embedding, points: Float[Array, "b n 3"])
     return jax.vmap(partial(sdf_one, prior))(embedding, points)
 
 
-def sdf(prior: Prior, embedding: Embedding, points: Float[Array, "b n 3"]) -> Float[Array, "b n"]:
+def sdf(
+    prior: Prior, embedding: Embedding, points: Float[Array | np.ndarray, "b n 3"]
+) -> Float[Array, "b n"]:
     """Signed distances of a batch of objects at points in each scan's frame (metres), canonical units.
 
     Multiply by `embedding.scale` for metres; negative inside (paper §3.1). Raises ValueError on shapes that differ.

@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float, Int
 
 SPARE = 8  # more candidates than neighbours asked for, before exact distances decide
 TINY = 1e-30  # guards squared norms: far below any feature, so it changes none (1e-12 would)
+NO_DIRECTION = 1e-19  # squared; its inverse square, in the gradient of a division, is still a float32
 
 # Unit gain keeps features near unit size through the blocks; smaller gains let them vanish.
 kernel_init = nn.initializers.variance_scaling(1.0, "fan_in", "normal")
@@ -25,7 +26,9 @@ def norm(x: Float[Array, "*b 3 c"]) -> Float[Array, "*b c"]:
 
 def channel_normalise(x: Float[Array, "*b 3 c"]) -> Float[Array, "*b 3 c"]:
     """Scales so that the squared lengths of all channels sum to 1 (unit direction times share of the norm)."""
-    return x * jax.lax.rsqrt(jnp.maximum(jnp.sum(x * x, axis=(-2, -1), keepdims=True), TINY))
+    squared = jnp.sum(x * x, axis=(-2, -1), keepdims=True)
+    # The choice comes before the root: behind it, an infinite slope times 0 would make the gradient NaN.
+    return x * jax.lax.rsqrt(jnp.where(squared > TINY, squared, 1.0))
 
 
 def vn_leaky_relu(
@@ -35,7 +38,7 @@ def vn_leaky_relu(
     along = jnp.sum(q * k, axis=-2, keepdims=True)
     length = jnp.sum(k * k, axis=-2, keepdims=True)
     # A zero direction removes nothing; dividing by 1 there keeps the gradient finite.
-    share = jnp.where(length > TINY, jnp.minimum(along, 0.0) / jnp.where(length > TINY, length, 1.0), 0.0)
+    share = jnp.minimum(along, 0.0) / jnp.where(length > NO_DIRECTION, length, 1.0)
     return q - (1.0 - leak) * share * k
 
 

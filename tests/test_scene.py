@@ -1,0 +1,138 @@
+"""A scene over several scans: who is kept, what is skipped, what came and went, where things were put."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from factories import turn_z
+
+from more2_jax import registration
+from more2_jax.config import JointConfig, preset
+from more2_jax.objects import apply_pose, points_of
+from more2_jax.scene import add_scan, reconstruct, start_scene
+from more2_jax.types import Instance, Mesh, Scan
+
+MARK = Mesh(vertices=np.zeros((3, 3)), faces=np.array([[0, 1, 2]]))
+ROBUST = preset("robust", upright=True)
+CONFIG = dataclasses.replace(
+    ROBUST,
+    registration=dataclasses.replace(ROBUST.registration, yaw_starts=8, steps=3, icp_steps=8, keep_starts=2),
+    joint=JointConfig(points=32, start="accumulated", steps=3),
+    meshing=dataclasses.replace(ROBUST.meshing, coarse=16, resolution=16),
+)
+
+
+def piece(kind: int) -> np.ndarray:
+    """Points of a shape without symmetry: a box face set with a fin, of a size of its own."""
+    rng = np.random.default_rng(kind)
+    size = np.array([[0.8, 0.4, 0.5], [1.6, 0.7, 0.4], [0.5, 0.5, 1.4]][kind])
+    box = rng.uniform(-0.5, 0.5, (700, 3))
+    box[np.arange(700), rng.integers(0, 3, 700)] = rng.choice([-0.5, 0.5], 700)
+    fin = rng.uniform(0, 1, (200, 3)) * [0.1, 0.5, 0.9] + [0.35, 0, 0.5]
+    return np.concatenate([box, fin]) * size
+
+
+def scan(name: str, poses: dict[int, tuple[float, float]]) -> Scan:
+    """Pieces by kind, each turned by an angle and put at (x, 0); ids are 10 + kind."""
+    instances = []
+    for kind, (angle, x) in poses.items():
+        turn = turn_z(angle, np.zeros(3), np.array([x, 0.0, 0.0]))
+        instances.append(Instance(id=10 + kind, points=apply_pose(turn, piece(kind)), label=f"kind {kind}"))
+    return Scan(name=name, source=name, instances=tuple(instances))
+
+
+VISITS = (
+    {0: (0.0, 0.0), 1: (0.3, 3.0)},
+    {0: (0.0, 0.0), 2: (0.0, 6.0)},
+    {0: (1.0, 1.0), 1: (1.2, 4.0), 2: (0.0, 6.0)},
+)
+
+
+@pytest.fixture(scope="module")
+def scene(tiny_prior):
+    """Three visits: 0 stays, then moves; 1 goes and comes back; 2 comes and stays."""
+    made = start_scene(tiny_prior, scan("a", VISITS[0]), CONFIG)
+    for name, poses in zip("bc", VISITS[1:], strict=True):
+        made = add_scan(tiny_prior, made, scan(name, poses), CONFIG)
+    return made
+
+
+def test_objects_are_followed_through_absence(scene):
+    seen = {o.label: [(s.scan, s.instance) for s in o.observations] for o in scene.objects}
+    assert seen == {
+        "kind 0": [(0, 10), (1, 10), (2, 10)],
+        "kind 1": [(0, 11), (2, 11)],
+        "kind 2": [(1, 12), (2, 12)],
+    }
+
+
+def test_changes_name_what_stayed_moved_came_and_went(scene):
+    first, second = scene.changes
+    ids = {o.label: o.id for o in scene.objects}
+    assert (first.static, first.removed, first.added) == (
+        (ids["kind 0"],),
+        (ids["kind 1"],),
+        (ids["kind 2"],),
+    )
+    assert (second.moved, second.static, second.added) == (
+        (ids["kind 0"],),
+        (ids["kind 2"],),
+        (ids["kind 1"],),
+    )
+
+
+def test_every_pose_maps_its_observation_onto_the_reference(scene):
+    for o in scene.objects:
+        kind = int(o.label[-1])
+        reference = dict(enumerate(VISITS))[o.reference_scan][kind]
+        for seen in o.observations:
+            there = VISITS[seen.scan][kind]
+            true = turn_z(reference[0], np.zeros(3), np.array([reference[1], 0, 0])) @ np.linalg.inv(
+                turn_z(there[0], np.zeros(3), np.array([there[1], 0, 0]))
+            )
+            np.testing.assert_allclose(seen.T_ref_scan, true, atol=2e-3)
+
+
+def test_single_observations_can_be_had_back(scene):
+    o = scene.objects[0]
+    for seen, poses in zip(o.observations, VISITS, strict=True):
+        original = scan("again", poses).instances[0].points
+        np.testing.assert_allclose(points_of(o, seen), original, atol=1e-9)
+
+
+def test_reconstruction_gives_closed_frames_and_leaves_finished_objects_alone(tiny_prior, scene):
+    once = reconstruct(tiny_prior, scene, CONFIG)
+    for o in once.objects:
+        np.testing.assert_allclose(o.observations[0].T_ref_scan, np.eye(4), atol=1e-5)
+        assert np.isfinite(o.points).all()
+    marked = dataclasses.replace(
+        once, objects=tuple(dataclasses.replace(o, mesh=o.mesh or MARK) for o in once.objects)
+    )
+    again = reconstruct(tiny_prior, marked, CONFIG)
+    assert all(a is b for a, b in zip(again.objects, marked.objects, strict=True))
+
+
+def test_another_scene_of_like_size_compiles_nothing_new(tiny_prior, scene):
+    before = registration._register_many._cache_size()
+    other = start_scene(tiny_prior, scan("d", {0: (2.0, 0.0), 1: (0.0, 3.0), 2: (1.0, 7.0)}), CONFIG)
+    add_scan(tiny_prior, other, scan("e", {0: (1.0, 1.0), 2: (0.5, 6.0)}), CONFIG)
+    assert registration._register_many._cache_size() == before
+
+
+def test_one_scan_alone_is_a_scene_without_changes(tiny_prior):
+    made = start_scene(tiny_prior, scan("only", VISITS[0]), CONFIG)
+    assert made.changes == ()
+    assert [len(o.observations) for o in made.objects] == [1, 1]
+
+
+def test_small_instances_are_reported_and_the_rest_goes_on(tiny_prior):
+    whole = scan("a", VISITS[0])
+    small = Instance(id=99, points=piece(0)[:5])
+    made = start_scene(tiny_prior, dataclasses.replace(whole, instances=(*whole.instances, small)), CONFIG)
+    assert [s.what for s in made.scans[0].skipped] == ["instance 99"]
+    assert "5 points; needed 64" in made.scans[0].skipped[0].reason
+    assert len(made.objects) == 2
+    with pytest.raises(ValueError, match="none with 64 points"):
+        start_scene(tiny_prior, dataclasses.replace(whole, instances=(small,)), CONFIG)
