@@ -106,7 +106,7 @@ def test_padding_and_garbage_in_it_do_not_matter(prior):
     assert_same(encode(prior, pad_clouds([furniture(3, count=200)], size=1024)), encode(prior, cloud))
 
 
-@pytest.mark.parametrize("batch", [1, 3, 4])
+@pytest.mark.parametrize("batch", [3, 4])
 def test_the_rest_of_the_batch_does_not_matter(prior, batch):
     clouds = [furniture(seed) for seed in range(4)]
     alone = encode(prior, pad_clouds(clouds[:1]))
@@ -138,19 +138,19 @@ DEGENERATE = {
 }
 
 
-@pytest.mark.parametrize("name", DEGENERATE)
-def test_degenerate_clouds_have_finite_codes_and_gradients(prior, name):
-    cloud = pad_clouds([DEGENERATE[name]])
-    embedding = encode(prior, cloud)
-    assert all(np.isfinite(getattr(embedding, leaf)).all() for leaf in LEAVES)
+def test_degenerate_clouds_have_finite_codes_and_gradients(prior):
+    cloud = pad_clouds(list(DEGENERATE.values()))
 
-    def total(points: jax.Array) -> jax.Array:
-        e = encode_one(prior, points, cloud.mask[0])
-        return e.inv.sum() + e.eqv.sum() + e.scale + e.center.sum()
+    def total(points: jax.Array, mask: jax.Array) -> tuple[jax.Array, Embedding]:
+        e = encode_one(prior, points, mask)
+        return e.inv.sum() + e.eqv.sum() + e.scale + e.center.sum(), e
 
-    gradient = np.asarray(jax.jit(jax.grad(total))(cloud.points[0]))
-    assert np.isfinite(gradient).all()
-    assert (gradient[~np.asarray(cloud.mask[0])] == 0).all()
+    gradients, codes = jax.jit(jax.vmap(jax.grad(total, has_aux=True)))(cloud.points, cloud.mask)
+    finite = jax.tree.map(lambda x: np.isfinite(x).reshape(len(x), -1).all(axis=1), (gradients, codes))
+    for ok in jax.tree.leaves(finite):
+        assert ok.all(), [name for name, good in zip(DEGENERATE, ok, strict=True) if not good]
+    assert (np.asarray(gradients)[~np.asarray(cloud.mask)] == 0).all()
+    assert (np.abs(gradients).max(axis=(1, 2)) > 0)[2]  # five points: not cut off altogether
 
 
 def test_gradient_agrees_with_finite_differences():
