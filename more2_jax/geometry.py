@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int
 from more2_jax.types import pytree
 
 TINY = 1e-30
-FAR = 1e12  # squared distance to a row that is not there: larger than any, yet finite
+FAR = 1e30  # squared distance to a row that is not there: larger than any, yet finite
 
 
 def farthest_points(
@@ -23,6 +23,9 @@ def farthest_points(
 
     Exact duplicates are taken once: rows beyond the distinct points repeat one and are masked out.
     """
+    points = jnp.where(
+        mask[:, None], points, 0.0
+    )  # whatever stands in masked rows, even NaN, goes no further
     fixed = jax.lax.stop_gradient(points)
 
     def body(carry: tuple[Array, Array], _: None) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
@@ -50,7 +53,7 @@ class Sampled:
 
 def sample(points: Float[Array, "n 3"], mask: Bool[Array, " n"], count: int, dense: bool) -> Sampled:
     """`count` farthest points of a cloud, beside all of it, or (`dense` False) beside nothing more."""
-    points = jnp.where(mask[:, None], points, 0.0)  # whatever stands in masked rows, even NaN, goes no further
+    points = jnp.where(mask[:, None], points, 0.0)
     sparse, sparse_mask = farthest_points(points, mask, count)
     if dense:
         return Sampled(points=sparse, mask=sparse_mask, dense=points, dense_mask=mask)
