@@ -52,8 +52,7 @@ def main(
         seed: of furniture, places and noise.
         upright: objects only turn about the vertical, and the method is told so.
     """
-    reader = read_ikea if "ikea" in source.name else read_meshes
-    meshes, weights = list(reader(source)), load_prior(prior)
+    meshes, weights = list((read_ikea if "ikea" in source.name else read_meshes)(source)), load_prior(prior)
     config = preset("robust", upright=upright)
     rows = [
         one_room(
@@ -67,9 +66,8 @@ def main(
     ]
     results = {name: summary([row[name] for row in rows]) for name in rows[0]}
     out.mkdir(parents=True, exist_ok=True)
-    (out / "results.json").write_text(
-        json.dumps({"prior": weights.name, "regime": regime, **results}, indent=1)
-    )
+    report = {"prior": weights.name, "regime": regime, **results}
+    (out / "results.json").write_text(json.dumps(report, indent=1))
     Console().print(results_table(results))
 
 
