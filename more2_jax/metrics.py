@@ -72,15 +72,15 @@ def scene_recall(recalls: Errors, share: float) -> float:
     return float(np.mean(np.asarray(recalls) >= share)) if len(recalls) else float("nan")
 
 
-def transform(T_a_b: Pose, points: Points) -> Points:
-    """Points of frame b in frame a."""
+def apply_pose(T_a_b: Pose, points: Points) -> Points:
+    """Points of frame b in frame a; float64."""
     return points @ T_a_b[:3, :3].T + T_a_b[:3, 3]
 
 
 def transformation_rmse(T: Pose, T_true: Pose, source: Points, target: Points) -> float:
     """Root mean square distance between where two poses put points, over both directions, metres."""
-    there = transform(T, source) - transform(T_true, source)
-    back = transform(np.linalg.inv(T), target) - transform(np.linalg.inv(T_true), target)
+    there = apply_pose(T, source) - apply_pose(T_true, source)
+    back = apply_pose(np.linalg.inv(T), target) - apply_pose(np.linalg.inv(T_true), target)
     return float(np.sqrt(np.mean(np.sum(np.concatenate([there, back]) ** 2, axis=1))))
 
 
@@ -94,10 +94,10 @@ def modified_chamfer(T: Pose, T_true: Pose, source: Points, target: Points) -> f
 
     Whole: each cloud together with the other under the true pose, so that missing parts do not count.
     """
-    whole_target = np.concatenate([target, transform(T_true, source)])
-    whole_source = np.concatenate([source, transform(np.linalg.inv(T_true), target)])
-    there = KDTree(whole_target).query(transform(T, source))[0]
-    back = KDTree(whole_source).query(transform(np.linalg.inv(T), target))[0]
+    whole_target = np.concatenate([target, apply_pose(T_true, source)])
+    whole_source = np.concatenate([source, apply_pose(np.linalg.inv(T_true), target)])
+    there = KDTree(whole_target).query(apply_pose(T, source))[0]
+    back = KDTree(whole_source).query(apply_pose(np.linalg.inv(T), target))[0]
     return float(np.mean(there**2) + np.mean(back**2))
 
 

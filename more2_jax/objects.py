@@ -9,16 +9,11 @@ import numpy as np
 from jaxtyping import Float
 
 from more2_jax.config import SceneConfig
-from more2_jax.metrics import rotation_error_deg
+from more2_jax.metrics import apply_pose, rotation_error_deg
 from more2_jax.types import Changes, Embedding, Instance, Observation, SceneObject
 
 Pose = Float[np.ndarray, "4 4"]
 Points = Float[np.ndarray, "n 3"]
-
-
-def apply_pose(T_a_b: Pose, points: Points) -> Points:
-    """Points of frame b in frame a; float64."""
-    return points @ T_a_b[:3, :3].T + T_a_b[:3, 3]
 
 
 def new_object(number: int, scan: int, instance: Instance, embedding: Embedding) -> SceneObject:

@@ -156,8 +156,8 @@ def moved(T, points):
     return np.array([(T @ [*p, 1.0])[:3] for p in points])
 
 
-def test_transform_is_the_homogeneous_product():
-    np.testing.assert_allclose(metrics.transform(T_TRUE, CLOUD), moved(T_TRUE, CLOUD), atol=1e-12)
+def test_apply_pose_is_the_homogeneous_product():
+    np.testing.assert_allclose(metrics.apply_pose(T_TRUE, CLOUD), moved(T_TRUE, CLOUD), atol=1e-12)
 
 
 def test_rmse_is_the_root_of_the_mean_square_over_both_directions():

@@ -18,7 +18,6 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import orbax.checkpoint as ocp
-import tyro
 from jax import Array
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
@@ -28,6 +27,7 @@ from more2_jax.data.shards import Shapes, load_shapes
 from more2_jax.losses import total_loss
 from more2_jax.prior import Prior, encode_ordered, init_prior, save_prior
 from more2_jax.types import pytree
+from train.program import run
 from train.validation import validate
 
 
@@ -52,17 +52,17 @@ def main(config: Path, shards: Path, out: Path, minutes: float = math.inf, name:
         name: of the weights; by default the configuration file's.
     """
     deadline = time.monotonic() + 60 * minutes
-    run = load_config(config, TrainingRun)
+    settings = load_config(config, TrainingRun)
     train, val = load_shapes(shards, "train"), load_shapes(shards, "val")
-    model = calibrated(run.model, run.training, train)
-    prior = init_prior(model, jax.random.key(run.training.seed), name or config.stem)
+    model = calibrated(settings.model, settings.training, train)
+    prior = init_prior(model, jax.random.key(settings.training.seed), name or config.stem)
     out.mkdir(parents=True, exist_ok=True)
-    state = initial_state(prior, run.training)
+    state = initial_state(prior, settings.training)
     options = ocp.CheckpointManagerOptions(max_to_keep=2)
     with ocp.CheckpointManager((out / "checkpoints").absolute(), options=options) as manager:
         if (latest := manager.latest_step()) is not None:
             state = manager.restore(latest, args=ocp.args.StandardRestore(state))
-        state = train_until(deadline, state, prior, run.training, train, val, out, manager)
+        state = train_until(deadline, state, prior, settings.training, train, val, out, manager)
     save_prior(dataclasses.replace(prior, params=state.average), out / "weights.npz")
 
 
@@ -168,4 +168,4 @@ def report(
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    run(main)
