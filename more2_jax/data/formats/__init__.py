@@ -1,0 +1,1 @@
+"""The formats of scans, a module each; `registry` lists them."""

@@ -1,0 +1,59 @@
+"""An NPZ with `points` (n, 3), `instance` (n,) and optional `label`, `color`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from more2_jax.data.labelled import UNREADABLE, LabelledCloud, ReadOptions
+
+
+def recognises(path: Path) -> bool:
+    """Whether this is an NPZ file, by its suffix."""
+    return path.is_file() and path.suffix.lower() == ".npz"
+
+
+def read(path: Path, options: ReadOptions) -> LabelledCloud:
+    key = options.instance_property or "instance"
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays = {k: file[k] for k in ("points", key, "label", "color") if k in file.files}
+            names = ", ".join(file.files) or "nothing"
+    except UNREADABLE as error:
+        raise ValueError(f"{path}: not a readable NPZ file ({' '.join(str(error).split())})") from error
+    if missing := [k for k in ("points", key) if k not in arrays]:
+        raise ValueError(f"{path}: arrays are {names}; needed {' and '.join(missing)} too")
+    _check_npz(path, arrays, key)
+    labels = arrays.get("label") if key != "label" else None
+    return LabelledCloud(
+        points=arrays["points"].astype(np.float64),
+        instance=arrays[key].astype(np.int64),
+        colors=_colors(arrays.get("color")),
+        point_labels=labels,
+    )
+
+
+def _check_npz(path: Path, arrays: dict[str, np.ndarray], key: str) -> None:
+    points, count = arrays["points"], len(np.atleast_1d(arrays["points"]))
+    needed = {"points": ((count, 3), "iuf"), key: ((count,), "iu"), "color": ((count, 3), "iuf")}
+    needed |= {"label": ((count,), "iuUS")} if key != "label" else {}
+    if points.ndim != 2:
+        raise ValueError(f"{path}: points have shape {points.shape}; needed (n, 3)")
+    for name, (shape, kinds) in needed.items():
+        array = arrays.get(name)
+        if array is not None and array.shape != shape:
+            raise ValueError(f"{path}: {name} has shape {array.shape}; needed {shape}")
+        if array is not None and array.dtype.kind not in kinds:
+            raise ValueError(f"{path}: {name} holds {array.dtype}; needed {_kinds_in_words(kinds)}")
+
+
+def _kinds_in_words(kinds: str) -> str:
+    words = {"iu": "integers", "iuf": "numbers", "iuUS": "integers or strings"}
+    return words[kinds]
+
+
+def _colors(colors: np.ndarray | None) -> np.ndarray | None:
+    if colors is None:
+        return None
+    return np.clip(colors * 255.0 if colors.dtype.kind == "f" else colors, 0, 255).astype(np.uint8)

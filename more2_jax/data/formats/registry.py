@@ -1,0 +1,28 @@
+"""The formats of scans, the most particular first: the first that recognises a path reads it.
+
+A format is a module of this package with `recognises(path) -> bool`, which looks and never raises, and
+`read(path, options) -> LabelledCloud`, which raises ValueError, in one line, on what it cannot read.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Protocol
+
+from more2_jax.data.formats import npz_scan, ply_folder, ply_scan
+from more2_jax.data.labelled import LabelledCloud, ReadOptions
+
+
+class Format(Protocol):
+    """What a format's module offers."""
+
+    def recognises(self, path: Path) -> bool:
+        """Whether the path is of this format, judged by names; never raises."""
+        ...
+
+    def read(self, path: Path, options: ReadOptions) -> LabelledCloud:
+        """The points and their instances. ValueError, in one line, if that fails."""
+        ...
+
+
+FORMATS: tuple[Format, ...] = (ply_scan, npz_scan, ply_folder)

@@ -1,0 +1,48 @@
+"""What every format of scans comes down to."""
+
+from __future__ import annotations
+
+import zipfile
+import zlib
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from more2_jax.types import Skipped
+
+# What NumPy and zipfile raise for files that are damaged, encrypted, pickled, or a lone array.
+UNREADABLE = (
+    ValueError,
+    OSError,
+    EOFError,
+    zipfile.BadZipFile,
+    zlib.error,
+    TypeError,
+    RuntimeError,
+    KeyError,
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReadOptions:
+    """What the caller knows of a file beyond its format."""
+
+    instance_property: str | None = None  # property of the points that names the instance
+    masks: Path | None = None  # predicted masks beside the cloud (Mask3D)
+    masks_needed: bool = True  # False: a cloud without masks is welcome, it is segmented afterwards
+
+
+@dataclass(frozen=True, kw_only=True)
+class LabelledCloud:
+    """Points with the instance they belong to."""
+
+    points: Float[np.ndarray, "n 3"]  # float64, in the file's unit
+    instance: Int[np.ndarray, "n"] | None  # 0 and negative: background; None: the file has no masks
+    colors: Int[np.ndarray, "n 3"] | None = None  # uint8
+    point_labels: np.ndarray | None = None  # (n,) str or integer
+    labels: dict[int, str] = field(default_factory=dict)  # instance → label, where the format says it once
+    skipped: tuple[Skipped, ...] = ()
+    unit: str | None = None  # m, cm or mm where the format fixes it, whatever the caller says
+    warnings: tuple[str, ...] = ()
