@@ -15,7 +15,7 @@ from plyfile import PlyData, PlyElement
 from more2_jax.data.depth_views import depth_views
 from more2_jax.data.flying_scenes import arrange
 from more2_jax.data.flying_shape import PlacedMesh, SensorConfig, scan_room, yaw_symmetry
-from more2_jax.data.signed_distance import canonical
+from more2_jax.data.solids import canonical
 from more2_jax.data.sweethome3d import Furniture, read_catalogue
 from train.program import run
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import trimesh
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 from trimesh.ray.ray_pyembree import RayMeshIntersector
 
 VIEWS = 24
-POINTS_A_VIEW = 384
+POINTS_A_VIEW = 512
 PIXELS = 64  # a side
 DISTANCE = 1.6  # of the camera from the centre, canonical units
 HALF_FIELD = 0.42  # tangent of half the field of view: the whole unit shape is seen
@@ -45,10 +45,52 @@ def depth_views(
     caster = RayMeshIntersector(trimesh.Trimesh(vertices, faces, process=False))
     views = []
     for toward in view_directions():
-        rays = pixel_rays(toward)
-        eyes = np.tile(DISTANCE * toward, (len(rays), 1))
-        hits, _, _ = caster.intersects_location(eyes, rays, multiple_hits=False)
+        hits, _ = view_hits(caster, toward)
         if len(hits) < fewest_hits:
             raise ValueError(f"a view has {len(hits)} hits; needed {fewest_hits}")
         views.append(hits[rng.choice(len(hits), POINTS_A_VIEW, replace=len(hits) < POINTS_A_VIEW)])
     return np.stack(views)
+
+
+def view_hits(
+    caster: RayMeshIntersector, toward: Float[np.ndarray, " 3"]
+) -> tuple[Float[np.ndarray, "h 3"], Int[np.ndarray, " h"]]:
+    """First hits of the pixels' rays of the camera on the side `toward`, and the faces that were hit."""
+    rays = pixel_rays(toward)
+    eyes = np.tile(DISTANCE * toward, (len(rays), 1))
+    hits, _, face = caster.intersects_location(eyes, rays, multiple_hits=False)
+    return hits, face
+
+
+def seen_from(
+    caster: RayMeshIntersector, eye: Float[np.ndarray, " 3"], points: Float[np.ndarray, "p 3"]
+) -> Bool[np.ndarray, " p"]:
+    """Whether surface points are the first thing on the line from `eye`."""
+    ray = points - eye
+    length = np.linalg.norm(ray, axis=1)
+    hits, index, _ = caster.intersects_location(
+        np.tile(eye, (len(ray), 1)), ray / length[:, None], multiple_hits=False
+    )
+    first = np.full(len(points), np.inf)
+    first[index] = np.linalg.norm(hits - eye, axis=1)
+    return np.abs(first - length) < 1e-3
+
+
+def coverage(
+    vertices: Float[np.ndarray, "v 3"], faces: np.ndarray, rng: np.random.Generator, count: int = 4000
+) -> float:
+    """Share of the visible surface that the depth views see.
+
+    Visible is what some of 300 directions around sees, of `count` points spread evenly over the surface.
+    """
+    mesh = trimesh.Trimesh(vertices, faces, process=False)
+    caster = RayMeshIntersector(mesh)
+    points, _ = trimesh.sample.sample_surface(mesh, count, seed=int(rng.integers(2**31)))
+    points = np.asarray(points)
+    by_views, by_any = np.zeros(count, bool), np.zeros(count, bool)
+    for toward in view_directions():
+        by_views |= seen_from(caster, DISTANCE * toward, points)
+    for toward in view_directions(300):
+        left = np.flatnonzero(~(by_any | by_views))
+        by_any[left] = seen_from(caster, DISTANCE * toward, points[left])
+    return float(by_views.sum() / max(1, (by_views | by_any).sum()))

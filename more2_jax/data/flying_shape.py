@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from trimesh.ray.ray_pyembree import RayMeshIntersector
 
 from more2_jax.data.depth_views import DISTANCE, pixel_rays
-from more2_jax.data.signed_distance import canonical
+from more2_jax.data.solids import canonical
 
 Pose = Float[np.ndarray, "4 4"]
 
