@@ -8,7 +8,9 @@ import pytest
 import trimesh
 
 from more2_jax.data.heldout import IKEA_LONGEST_M, read_ikea
+from more2_jax.data.mesh_files import read_mesh_file
 from more2_jax.data.meshes import SourceMesh, check_mesh, read_meshes, standing, write_packed
+from more2_jax.data.shapenet import SYNSETS
 
 UNSEEN = Path(__file__).parent / "data" / "unseen_furniture.npz"
 
@@ -44,8 +46,8 @@ def test_a_collection_without_categories_is_named_after_its_file(tmp_path: Path)
 
 def test_trash_cans_get_a_size_and_nothing_else_does(tmp_path: Path):
     wide = [mesh("TrashFactory_0001", (1.2, 1.2, 1.5)), mesh("ChairFactory_0001", (1.2, 1.2, 1.5))]
-    write_packed(tmp_path / "two.npz", wide)
-    can, chair = (np.ptp(m.vertices, axis=0) for m in read_meshes(tmp_path / "two.npz"))
+    write_packed(tmp_path / "infinigen_two.npz", wide)
+    can, chair = (np.ptp(m.vertices, axis=0) for m in read_meshes(tmp_path / "infinigen_two.npz"))
     assert 0.25 <= can[2] <= 0.7
     np.testing.assert_allclose(can / can[2], [0.8, 0.8, 1], atol=1e-3)
     np.testing.assert_allclose(chair, [1.2, 1.2, 1.5], atol=1e-3)
@@ -59,6 +61,60 @@ def test_a_folder_of_meshes(tmp_path: Path):
     found = {m.name: m for m in read_meshes(tmp_path)}
     assert {k: m.category for k, m in found.items()} == {"chair/one.obj": "chair", "two.ply": "object"}
     np.testing.assert_allclose(np.ptp(found["chair/one.obj"].vertices, axis=0), (1, 2, 3))
+
+
+def test_a_table_names_category_split_and_licence(tmp_path: Path):
+    (tmp_path / "meshes").mkdir()
+    trimesh.creation.box((1, 2, 3)).export(tmp_path / "meshes" / "one.off")
+    trimesh.creation.icosphere(1).export(tmp_path / "meshes" / "two.stl")
+    table = tmp_path / "list.csv"
+    table.write_text("path,category,split,licence\nmeshes/one.off,chair,test,CC0\nmeshes/two.stl,,,\n")
+    one, two = read_meshes(table)
+    assert (one.category, one.split, one.licence, one.chosen_split) == ("chair", "test", "CC0", "test")
+    assert (two.category, two.split, two.licence) == ("object", None, "unknown")
+    table.write_text("path,split\nmeshes/one.off,tomorrow\n")
+    with pytest.raises(ValueError, match="split 'tomorrow'; needed train, val, test"):
+        list(read_meshes(table))
+    table.write_text("file\nmeshes/one.off\n")
+    with pytest.raises(ValueError, match="columns file; needed path"):
+        list(read_meshes(table))
+
+
+def test_unreadable_files_go_to_the_report_and_the_rest_is_read(tmp_path: Path):
+    trimesh.creation.box((1, 2, 3)).export(tmp_path / "good.ply")
+    for suffix in (".obj", ".off", ".stl", ".glb", ".ply"):
+        (tmp_path / f"torn{suffix}").write_bytes(b"\x00\xffnot a mesh")
+    told: dict[str, str] = {}
+    found = list(read_meshes(tmp_path, report=told.__setitem__))
+    assert "good.ply" in [m.name for m in found]
+    assert {f"torn{s}" for s in (".off", ".glb", ".ply")} <= set(told)
+    assert all("\n" not in reason for reason in told.values())
+    with pytest.raises(ValueError, match="not a readable mesh"):
+        read_mesh_file(tmp_path / "torn.glb", "x", "x", "x")
+
+
+def test_shapenet_layout_with_its_table_of_splits(tmp_path: Path):
+    synset = next(s for s, name in SYNSETS.items() if name == "chair")
+    for model in ("a1", "b2", "c3"):
+        (tmp_path / synset / model / "models").mkdir(parents=True)
+    for model in ("a1", "b2"):
+        trimesh.creation.box((1, 2, 3)).export(tmp_path / synset / model / "models" / "model_normalized.obj")
+    (tmp_path / "all.csv").write_text(
+        f"id,synsetId,subSynsetId,modelId,split\n1,{synset.lstrip('0')},x,a1,test\n"
+    )
+    told: dict[str, str] = {}
+    first, second = read_meshes(tmp_path, report=told.__setitem__)
+    assert (first.name, first.category, first.split) == (f"{synset}/a1", "chair", "test")
+    assert second.split is None
+    assert "ShapeNet" in second.licence
+    assert list(told) == [f"{synset}/c3"]
+    assert "model_normalized.obj" in told[f"{synset}/c3"]
+
+
+def test_the_content_hash_depends_on_the_geometry_alone():
+    one = mesh("a", (1, 2, 3))
+    assert one.content_hash == dataclasses.replace(one, name="b", category="x").content_hash
+    assert one.content_hash != mesh("a", (1, 2, 3.01)).content_hash
 
 
 def test_damaged_sources_are_refused_in_one_line(tmp_path: Path):

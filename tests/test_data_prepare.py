@@ -1,6 +1,7 @@
 """The preparation of shards: complete, resumable, reproducible; what is left out is named with its reason."""
 
 import dataclasses
+import filecmp
 import json
 import sys
 from pathlib import Path
@@ -10,8 +11,11 @@ import pytest
 import trimesh
 
 from more2_jax.data.meshes import SourceMesh
-from more2_jax.data.shards import load_shapes
-from train import prepare
+from more2_jax.data.procedural import procedural_mesh
+from more2_jax.data.shapes import make_shape
+from more2_jax.data.shards import load_shapes, open_shards, read_meta, read_solids, write_shard
+from more2_jax.data.source_mesh import VALIDATION_SHARE
+from train import census, prepare
 from train.program import run
 
 
@@ -35,20 +39,16 @@ SQUARE = [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]
         (broken(SQUARE, []), "0 faces"),
         (broken(SQUARE, [[0, 1, 9]]), "0 to 9 of 4"),
         (broken([[0, 0, 0]] * 3, [[0, 1, 2]]), "extent"),
-        (broken([[0, 0, np.nan], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]]), "extent"),
-        (broken([[0, 0, 0], [1, 0, 0], [0.5, 0, 1e-6]], [[0, 1, 2]]), "hits"),
+        (broken([[0, 0, np.nan], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]]), "not finite"),
+        (broken([[0, 0, 0], [1, 0, 0], [0.5, 0, 1e-6]], [[0, 1, 2]]), "flat"),
+        (broken([[0, 0, 0], [1, 0, 0], [0.5, 1, np.inf]], [[0, 1, 2]]), "not finite"),
     ],
 )
 def test_degenerate_meshes_are_named_with_a_reason(mesh: SourceMesh, reason: str):
     result = prepare.prepare(mesh)
-    assert result["name"] == "broken"
-    assert reason in result["reason"]
-
-
-def test_a_board_without_thickness_keeps_an_inside():
-    strip = np.array(SQUARE) * (1, 0.7, 1)
-    result = prepare.prepare(broken(strip.tolist(), [[0, 1, 2], [0, 2, 3]]))
-    assert result["sdf_near"][:, 3].min() < 0
+    assert isinstance(result, prepare.Rejected)
+    assert result.name == "broken"
+    assert reason in result.reason
 
 
 @pytest.fixture(scope="module")
@@ -61,53 +61,120 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+def same_files(one: Path, other: Path) -> bool:
+    names = sorted(p.name for p in one.iterdir())
+    return names == sorted(p.name for p in other.iterdir()) and all(
+        filecmp.cmp(one / n, other / n, shallow=False) for n in names
+    )
+
+
 def test_shards_resume_and_repeat(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(prepare, "SHARD", 2)
-    prepare.main(tmp_path, (folder,), procedural=1, workers=1)
-    first, second = sorted(tmp_path.glob("shard_*.npz"))
-    kept, arrays = first.stat().st_mtime_ns, dict(np.load(second))
-    second.unlink()
-    prepare.main(tmp_path, (folder,), procedural=1, workers=1)
-    assert first.stat().st_mtime_ns == kept
-    for name, array in np.load(second).items():
-        np.testing.assert_array_equal(array, arrays[name])
-    assert not list(tmp_path.glob("*.partial"))
-    names = {str(n) for path in (first, second) for n in np.load(path)["names"]}
-    assert names == {"box.ply", "ball.ply", "procedural_bench_0000"}
-    rejected = json.loads((tmp_path / "report.json").read_text())["rejected"]
+    out = tmp_path / "out"
+    prepare.main(out, (folder,), procedural=1, workers=1)
+    first, second = sorted(out.glob("shard_*"))
+    kept = (first / "views.npy").stat().st_mtime_ns
+    second.rename(tmp_path / "second")
+    prepare.main(out, (folder,), procedural=1, workers=1)
+    assert (first / "views.npy").stat().st_mtime_ns == kept
+    assert same_files(second, tmp_path / "second")
+    assert not list(out.glob("*.partial"))
+    names = {m["name"] for path in (first, second) for m in read_meta(path)}
+    assert names == {"box.ply", "ball.ply", procedural_meshes_name()}
+    rejected = json.loads((out / "report.json").read_text())["rejected"]
     assert list(rejected) == ["needle.ply"]
-    assert "hits" in rejected["needle.ply"]
+    assert "flat" in rejected["needle.ply"]
     with pytest.raises(ValueError, match="shards of other meshes"):
-        prepare.main(tmp_path, (folder,), procedural=2, workers=1)
+        prepare.main(out, (folder,), procedural=2, workers=1)
 
 
-def test_load_shapes_splits_and_skips_a_shard_without_shapes(tmp_path: Path):
-    def shape(name: str, split: str) -> dict:
-        return {
-            "views": np.zeros((24, 384, 3), np.float16),
-            "sdf_uniform": np.zeros((8000, 4), np.float16),
-            "sdf_near": np.zeros((8000, 4), np.float16),
-            "names": name,
-            "categories": "box",
-            "sources": "made",
-            "splits": split,
-            "scale_m": np.float32(1),
-        }
+def procedural_meshes_name() -> str:
+    return next(iter(prepare.procedural_meshes(1))).name
 
-    prepare.write_shard(tmp_path / "shard_000.npz", [])
-    prepare.write_shard(
-        tmp_path / "shard_001.npz", [shape("a", "train"), shape("b", "val"), shape("c", "train")]
+
+@pytest.mark.slow
+def test_a_cluster_makes_the_same_bytes(folder: Path, tmp_path: Path):
+    """Two nodes of a Ray cluster on this machine against one process."""
+    pytest.importorskip("ray", reason="the cluster extra is not installed")
+    from ray.cluster_utils import Cluster
+
+    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1})
+    cluster.add_node(num_cpus=1)
+    try:
+        prepare.main(tmp_path / "ray", (folder,), procedural=3, ray=cluster.address)
+    finally:
+        cluster.shutdown()
+    prepare.main(tmp_path / "alone", (folder,), procedural=3, workers=1)
+    assert same_files(tmp_path / "ray" / "shard_000", tmp_path / "alone" / "shard_000")
+
+
+def test_ray_is_asked_for_and_missing(tmp_path: Path, folder: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setitem(sys.modules, "ray", None)
+    with pytest.raises(ValueError, match=r"more2-jax\[cluster\]"):
+        prepare.main(tmp_path, (folder,), ray="local")
+
+
+def piece(name: str, seed: int, split: str) -> SourceMesh:
+    made = procedural_mesh("stool", seed)
+    return dataclasses.replace(made, name=name, split=split)
+
+
+@pytest.fixture(scope="module")
+def shards(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three shards, one of them empty; `b` in validation is the same stool as `a`, which is trained on."""
+    path = tmp_path_factory.mktemp("shards")
+    write_shard(path / "shard_000", [])
+    shapes = [piece("a", 0, "train"), piece("b", 0, "val"), piece("c", 1, "train"), piece("t", 2, "test")]
+    made = [make_shape(s, 300) for s in shapes]
+    write_shard(path / "shard_001", made[:3])
+    write_shard(path / "shard_002", made[3:])
+    (path / "report.json").write_text(
+        json.dumps({"rejected": {"x": "flat: 0.001 thick", "y": "flat: 0 thick"}})
     )
-    assert load_shapes(tmp_path, "train").views.shape == (2, 24, 384, 3)
-    assert load_shapes(tmp_path, "val").sdf_near.shape == (1, 8000, 4)
-    with pytest.raises(ValueError, match="no test shapes"):
-        load_shapes(tmp_path, "test")
+    return path
+
+
+def test_shards_open_by_split_mapped_or_in_memory(shards: Path):
+    view = open_shards(shards, "train")
+    assert [m["name"] for m in view.meta] == ["a", "c"]
+    assert len(view) == 2
+    loaded = load_shapes(shards, "train", queries=100)
+    assert loaded.views.shape == (2, 24, 512, 3)
+    assert loaded.sdf_near.shape == (2, 100, 4)
+    np.testing.assert_array_equal(loaded.sdf_uniform[1], view[1]["sdf_uniform"][:100])
+    assert len(open_shards([shards, shards], "train")) == 4
+    assert load_shapes(shards, "train", most=1).views.shape[0] == 1
+    with pytest.raises(ValueError, match="no holiday shapes"):
+        open_shards(shards, "holiday")
+    with pytest.raises(ValueError, match="no shards"):
+        open_shards(shards / "shard_001", "train")
+
+
+def test_solids_come_back_closed_and_canonical(shards: Path):
+    solids = read_solids(shards / "shard_001")
+    assert [s.name for s in solids] == ["a", "b", "c"]
+    for solid in solids:
+        assert trimesh.Trimesh(solid.vertices, solid.faces, process=False).is_watertight
+        np.testing.assert_allclose(np.ptp(solid.vertices, axis=0).max(), 0.9, atol=1e-4)
+    assert read_solids(shards / "shard_000") == []
+
+
+def test_the_census_counts_checks_and_leaves_twins_out(shards: Path, tmp_path: Path):
+    census.main((shards,), tmp_path / "census.md")
+    text = (tmp_path / "census.md").read_text()
+    assert "Closed solids: 4 of 4" in text
+    assert "| flat | 2 |" in text
+    assert "| val shape nearly the same as a train shape (below 0.004) | 1 |" in text
+    assert [m["name"] for m in open_shards(shards, "train").meta] == ["a", "c"]
+    with pytest.raises(ValueError, match="no val shapes"):
+        open_shards(shards, "val")
+    (shards / "excluded.json").unlink()
 
 
 def test_about_a_tenth_is_kept_for_validation_whatever_the_order():
     mesh = broken(SQUARE, [[0, 1, 2]])
     digests = [dataclasses.replace(mesh, name=f"model_{k}").digest for k in range(2000)]
-    share = np.mean([d % 2**16 % prepare.VALIDATION_SHARE == 0 for d in digests])
+    share = np.mean([d % 2**16 % VALIDATION_SHARE == 0 for d in digests])
     assert 0.08 < share < 0.12
 
 

@@ -7,15 +7,18 @@ import trimesh
 from scipy.spatial.transform import Rotation
 from shapes import box_distance, sphere
 
-from more2_jax.data.depth_views import POINTS_A_VIEW, VIEWS, depth_views, view_directions
+from more2_jax.data.depth_views import POINTS_A_VIEW, VIEWS, coverage, depth_views, view_directions
 from more2_jax.data.procedural import procedural_mesh
-from more2_jax.data.signed_distance import BOX, QUERIES, SHELL, canonical, measured_offset, signed_distances
+from more2_jax.data.shapes import fingerprint, make_shape
+from more2_jax.data.signed_distance import BOX, check_signs, is_inside, signed_distances
+from more2_jax.data.solids import canonical, solidify
+
+QUERIES = 8000
 
 
 def labelled(vertices: np.ndarray, faces: np.ndarray, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    rng = np.random.default_rng(seed)
-    views = depth_views(vertices, faces, rng)
-    return signed_distances(vertices, faces, views.reshape(-1, 3)[::10], rng)
+    uniform, near = signed_distances(vertices, faces, np.random.default_rng(seed), QUERIES)
+    return uniform.astype(np.float64), near.astype(np.float64)
 
 
 # --- the canonical frame ------------------------------------------------------------------------------------
@@ -39,31 +42,47 @@ def test_canonical_refuses_what_has_no_size(bad: np.ndarray):
 
 
 def test_distances_of_a_sphere():
-    for query in labelled(*sphere(0.45)):
+    for query in labelled(*sphere(0.45, subdivisions=5)):
         error = query[:, 3] - (np.linalg.norm(query[:, :3], axis=1) - 0.45)
-        assert np.abs(error + SHELL).max() < 0.006  # the solid is a shell thicker, by design
+        assert np.abs(error).max() < 0.001
 
 
-def test_distances_of_a_flat_box_with_its_winding_turned_inside_out():
+def test_distances_of_a_flat_box_in_any_orientation():
     half = np.array([0.45, 0.1, 0.02])
     box = trimesh.creation.box(2 * half)
     turn = Rotation.from_euler("xyz", [0.3, 0.5, 0.7]).as_matrix()
-    for query in labelled(box.vertices @ turn.T, np.asarray(box.faces[:, ::-1])):
+    for query in labelled(box.vertices @ turn.T, np.asarray(box.faces)):
         error = query[:, 3] - box_distance(query[:, :3] @ turn, half)
-        assert np.abs(error + SHELL).max() < 0.008
+        assert np.abs(error).max() < 4e-4  # half a step of float16
 
 
-@pytest.mark.parametrize("category", ["bench", "cushion", "stool"])
+def test_distances_belong_to_the_rounded_positions():
+    uniform, near = signed_distances(*sphere(0.45, subdivisions=5), np.random.default_rng(0), 500)
+    assert uniform.dtype == near.dtype == np.float16
+    query = near[:, :3].astype(np.float64)
+    np.testing.assert_allclose(np.linalg.norm(query, axis=1) - 0.45, near[:, 3], atol=6e-4)
+
+
+@pytest.mark.parametrize("category", ["bench", "stool", "bed"])
 def test_signs_agree_with_winding_numbers(category: str):
     piece = procedural_mesh(category, 0)
     vertices, _ = canonical(piece.vertices)
     query = np.concatenate(labelled(vertices, piece.faces))
-    clear = query[np.abs(query[:, 3]) > 0.012]  # beyond the shell and the octree's cells
-    faces = piece.faces.astype(np.int32)
-    winding = pcu.triangle_soup_fast_winding_number(vertices, faces, clear[:, :3].copy())
-    inside = clear[:, 3] < 0
+    winding = pcu.triangle_soup_fast_winding_number(
+        vertices, piece.faces.astype(np.int32), np.ascontiguousarray(query[:, :3])
+    )
+    inside = query[:, 3] < 0
     assert inside.sum() > 100
-    assert np.mean(inside == (winding > 0.5)) > 0.998
+    assert np.mean(inside == (winding > 0.5)) > 0.995
+
+
+def test_signs_that_disagree_are_refused():
+    vertices, faces = sphere(0.45)
+    query = np.random.default_rng(0).uniform(-0.5, 0.5, (400, 3))
+    inside = is_inside(vertices, faces, query)
+    check_signs(vertices, faces, query, inside)
+    with pytest.raises(ValueError, match="agree on 0"):
+        check_signs(vertices, faces, query, inside ^ (np.arange(400) % 50 == 0))
 
 
 def test_queries_fill_the_box_and_hug_the_surface():
@@ -84,12 +103,26 @@ def test_a_seed_decides_alone():
     assert not np.array_equal(one, other)
 
 
-def test_a_solid_that_is_not_the_shape_is_refused():
-    assert measured_offset(np.full(10, -0.008)) == pytest.approx(0.008)
-    with pytest.raises(ValueError, match=r"0\.0500 outside"):
-        measured_offset(np.full(10, -0.05))
-    with pytest.raises(ValueError, match="off the solid"):
-        measured_offset(np.where(np.arange(10) < 7, -0.008, 0.2))
+def test_a_shape_depends_on_the_mesh_and_its_name_alone():
+    piece = procedural_mesh("stool", 3)
+    one, again = make_shape(piece, 200), make_shape(piece, 200)
+    for name in ("vertices", "views", "sdf_uniform", "sdf_near", "fingerprint"):
+        np.testing.assert_array_equal(getattr(one, name), getattr(again, name))
+    assert one.meta == again.meta
+    assert one.meta["split"] == piece.chosen_split
+    assert one.meta["coverage"] > 0.9
+    np.testing.assert_allclose(
+        np.ptp(piece.vertices, axis=0).max() / one.meta["units_per_canonical"], 0.9, atol=2e-3
+    )
+
+
+def test_a_fingerprint_turns_with_the_shape():
+    vertices, _ = canonical(procedural_mesh("sofa", 1).vertices)
+    solid = solidify(vertices, procedural_mesh("sofa", 1).faces)
+    quarter = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    turned = fingerprint(np.ascontiguousarray(solid.vertices @ quarter.T), solid.faces)
+    expected = np.rot90(fingerprint(solid.vertices, solid.faces), 1, axes=(0, 1))
+    np.testing.assert_allclose(turned.astype(float), expected.astype(float), atol=1e-3)
 
 
 # --- depth views --------------------------------------------------------------------------------------------
@@ -110,6 +143,15 @@ def test_views_see_the_near_side_of_the_surface_and_no_other():
     height = np.einsum("vnc,vc->vn", views, view_directions())
     assert height.min() > 0.45**2 / 1.6 - 0.01  # the horizon seen from 1.6
     assert (height.max(axis=1) > 0.445).all()
+
+
+def test_coverage_is_the_share_of_the_visible_surface_that_was_seen():
+    assert coverage(*sphere(0.45, subdivisions=5), np.random.default_rng(0)) == 1.0
+    # A deep narrow well: its bottom is seen along the axis only, which none of the 24 directions is.
+    tube = trimesh.creation.annulus(r_min=0.03, r_max=0.2, height=0.9)
+    tube.apply_transform(trimesh.geometry.align_vectors([0, 0, 1], view_directions(300)[40]))
+    deep = coverage(np.asarray(tube.vertices), np.asarray(tube.faces), np.random.default_rng(0))
+    assert 0.5 < deep < 0.97
 
 
 def test_a_slender_shape_repeats_points_and_one_too_slender_is_refused():

@@ -9,7 +9,8 @@ import pytest
 import trimesh
 from trimesh.exchange.obj import export_obj
 
-from more2_jax.data.sweethome3d import read_catalogue
+from more2_jax.data.meshes import read_meshes
+from more2_jax.data.sweethome3d import kind_of, read_catalogue
 
 PROPERTIES = """# a catalogue
 license=Public domain
@@ -66,3 +67,35 @@ def test_what_is_no_catalogue_is_refused(tmp_path: Path):
     for name in ("text.sh3f", "empty.sh3f", "missing.sh3f"):
         with pytest.raises(ValueError, match="not a SweetHome3D catalogue"):
             list(read_catalogue(tmp_path / name))
+
+
+def test_furniture_gets_its_kind_and_the_rest_is_told(catalogue: Path, tmp_path: Path):
+    with zipfile.ZipFile(catalogue) as archive:
+        model = archive.read("models/chair.obj")
+    text = PROPERTIES + (
+        "name#3=Man\nmodel#3=/models/chair.obj\ncategory#3=Characters\nwidth#3=1\ndepth#3=1\nheight#3=1\n"
+        "name#4=Thing\ntags#4=Nightstand, wood\nmodel#4=/models/chair.obj\nwidth#4=1\ndepth#4=1\nheight#4=1\n"
+        "name#5=Torn\nmodel#5=/models/torn.obj\nwidth#5=1\ndepth#5=1\nheight#5=1\n"
+    )
+    path = tmp_path / "more.sh3f"
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("PluginFurnitureCatalog.properties", text)
+        archive.writestr("models/chair.obj", model)
+    told: dict[str, str] = {}
+    found = list(read_meshes(path, report=told.__setitem__))
+    assert [(m.name, m.category) for m in found] == [
+        ("more_001", "chair"),
+        ("more_002", "lamp"),
+        ("more_004", "cabinet"),
+    ]
+    assert found[0].licence == "Public domain; Chair by Somebody"
+    assert "Characters" in told["more_003"]
+    assert "not readable" in told["more_005"]
+
+
+@pytest.mark.parametrize(
+    ("words", "kind"),
+    [("Desk lamp", "lamp"), ("Bathroom cabinet", "cabinet"), ("Bedside table", "cabinet"), ("Vase", None)],
+)
+def test_kind_of(words: str, kind: str | None):
+    assert kind_of(words) == kind

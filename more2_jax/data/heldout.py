@@ -11,7 +11,8 @@ import numpy as np
 from more2_jax.data.meshes import SourceMesh, read_meshes, standing
 from more2_jax.data.sweethome3d import Z_UP
 
-# IKEA-Manuals-at-Work comes without a scale: the longest edge that such a piece usually has, metres.
+IKEA_LICENCE = "CC-BY-4.0; IKEA-Manuals-at-Work"
+# The collection comes without a scale: the longest edge that such a piece usually has, metres.
 IKEA_LONGEST_M = {"Bench": 1.0, "Chair": 0.85, "Desk": 1.2, "Misc": 0.8, "Shelf": 1.2, "Table": 1.0}
 
 
@@ -26,4 +27,6 @@ def read_ikea(path: str | Path) -> Iterator[SourceMesh]:
             raise ValueError(f"{mesh.name}: category {category!r}; needed one of {', '.join(IKEA_LONGEST_M)}")
         vertices = mesh.vertices @ Z_UP.T
         vertices = vertices * (IKEA_LONGEST_M[category] / np.ptp(vertices, axis=0).max())
-        yield dataclasses.replace(mesh, category=category.lower(), vertices=standing(vertices))
+        yield dataclasses.replace(
+            mesh, category=category.lower(), vertices=standing(vertices), licence=IKEA_LICENCE
+        )

@@ -63,7 +63,7 @@ def read_packed(path: Path) -> Iterator[SourceMesh]:
         yield SourceMesh(
             name=str(name),
             category=str(category),
-            vertices=_in_metres(str(name), lo + v / LEVELS * (hi - lo)),
+            vertices=_in_metres(str(name) if infinigen else "", lo + v / LEVELS * (hi - lo)),
             faces=f.astype(np.int64),
             source=path.name,
             licence=str(licence),

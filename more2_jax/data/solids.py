@@ -87,7 +87,7 @@ def closed_parts(
     mesh = trimesh.Trimesh(vertices, faces, process=False)
     mesh.merge_vertices(merge_tex=True, merge_norm=True, digits_vertex=6)
     mesh.update_faces(mesh.nondegenerate_faces())
-    parts = [p for p in mesh.split(only_watertight=False) if p.area > 1e-9]
+    parts = [p for p in mesh.split(only_watertight=False, repair=False) if p.area > 1e-9]
     closed = [p for p in parts if p.is_watertight and p.is_winding_consistent]
     if sum(p.area for p in closed) < CLOSED_SHARE * mesh.area or mesh.area <= 0:
         return None
