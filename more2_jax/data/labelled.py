@@ -32,6 +32,7 @@ class ReadOptions:
     instance_property: str | None = None  # property of the points that names the instance
     masks: Path | None = None  # predicted masks beside the cloud (Mask3D)
     masks_needed: bool = True  # False: a cloud without masks is welcome, it is segmented afterwards
+    depth_frames: bool = False  # points from the raw depth frames rather than from the mesh (3RScan)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,3 +47,16 @@ class LabelledCloud:
     skipped: tuple[Skipped, ...] = ()
     unit: str | None = None  # m, cm or mm where the format fixes it, whatever the caller says
     warnings: tuple[str, ...] = ()
+
+
+def one_line(error: BaseException) -> str:
+    """What an exception says, without line breaks and control characters; its name if it says nothing."""
+    text = " ".join(str(error).split()) or type(error).__name__
+    return "".join(c if c.isprintable() else "?" for c in text)[:300]
+
+
+def instance_ids(path: Path, values: Int[np.ndarray, "n"]) -> Int[np.ndarray, "n"]:
+    """Whole numbers of any type as int64. ValueError, in one line, where they do not fit."""
+    if values.dtype.kind == "u" and values.max(initial=0) > np.iinfo(np.int64).max:
+        raise ValueError(f"{path}: instance {values.max()} is too large; needed less than 2⁶³")
+    return values.astype(np.int64)

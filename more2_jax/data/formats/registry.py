@@ -9,7 +9,16 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Protocol
 
-from more2_jax.data.formats import npz_scan, ply_folder, ply_scan
+from more2_jax.data.formats import (
+    npz_scan,
+    ply_folder,
+    ply_scan,
+    replica,
+    s3dis,
+    scannet,
+    scannetpp,
+    threerscan,
+)
 from more2_jax.data.labelled import LabelledCloud, ReadOptions
 
 
@@ -25,4 +34,14 @@ class Format(Protocol):
         ...
 
 
-FORMATS: tuple[Format, ...] = (ply_scan, npz_scan, ply_folder)
+FORMATS: tuple[Format, ...] = (
+    threerscan,
+    scannet,
+    scannetpp,
+    replica,
+    s3dis,
+    ply_scan,
+    npz_scan,
+    ply_folder,
+)
+WITH_DEPTH_FRAMES: tuple[Format, ...] = (threerscan,)
