@@ -166,7 +166,7 @@ def arms(rng: Rng, x: float, y: float, seat: float, rear: float) -> list[Manifol
             radius = rng.uniform(0.010, 0.015)
             low = seat - 0.02
             path = [(across, front + 0.03, low), (across, front, seat + rise), (across, rear, seat + rise)]
-            path = [(a * (out - 0.03), front + 0.03, low), *path]
+            path = [(a * (out - 0.06), front + 0.05, low), *path]
             parts.append(tube(bent(path, 0.05), radius))
         elif style == "board":
             wide = 0.05
@@ -174,9 +174,9 @@ def arms(rng: Rng, x: float, y: float, seat: float, rear: float) -> list[Manifol
             parts.append(top.translate((across, (front + rear) / 2, seat + rise - 0.011)))
             stand = front + 0.06
             parts.append(
-                post((a * (out - 0.012), stand, seat - 0.025), (across, stand, seat + rise), 0.028, 0.028)
+                post((a * (out - 0.04), stand, seat - 0.025), (across, stand, seat + rise), 0.028, 0.028)
             )
         else:
             pad = soft_box(0.07, rear - front, 0.045, (across, (front + rear) / 2, seat + rise - 0.02), 0.018)
-            parts += [pad, box(0.035, 0.04, rise + 0.03, (a * (out - 0.005), front + 0.1, seat - 0.03))]
+            parts += [pad, box(0.05, 0.04, rise + 0.03, (a * (out - 0.02), front + 0.1, seat - 0.03))]
     return parts

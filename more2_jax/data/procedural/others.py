@@ -98,7 +98,7 @@ def shade(rng: Rng, radius: float, tall: float) -> Manifold:
     inner = list(zip((outer - WALL).tolist(), heights.tolist(), strict=True))[::-1]
     ring = [*zip(outer.tolist(), heights.tolist(), strict=True), *inner]
     hollow = turned(ring, sides=4 if style == "square" else 32)
-    arm = float(np.interp(0, heights, outer)) - 0.4 * WALL
+    arm = float(np.interp(0, heights, outer)) - 0.8 * WALL
     spokes = [bar((-arm * c, -arm * s, 0), (arm * c, arm * s, 0), 0.005) for c, s in ((1, 0), (0, 1))]
     bulb = kernel().Manifold.sphere(min(0.03, 0.5 * arm), 12)
     solid = hollow + spokes[0] + spokes[1] + bulb

@@ -140,10 +140,10 @@ def loft(sections: Sequence[Float[np.ndarray, "n 3"]]) -> Manifold:
 
 def sheared(solid: Manifold, lean: float, above: float) -> Manifold:
     """Leans backwards (towards +y) by `lean` metres a metre above the height `above`."""
-    return solid.transform([[1, 0, 0, 0], [0, 1, lean, -lean * above], [0, 0, 1, 0]])
+    return solid.transform(np.array([[1, 0, 0, 0], [0, 1, lean, -lean * above], [0, 0, 1, 0]], float))
 
 
-def curved(solid: Manifold, bow: float, width: float, edge: float = 0.06) -> Manifold:
+def curved(solid: Manifold, bow: float, width: float, edge: float = 0.045) -> Manifold:
     """Bows a part that is wide along x: its middle moves towards +y by `bow`, its ends stay."""
 
     def bend(points: np.ndarray) -> np.ndarray:

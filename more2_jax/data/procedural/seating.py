@@ -79,7 +79,7 @@ def chair(rng: Rng) -> list[Manifold]:
 def _joints(x: float, wide: float, rear: float, top: float) -> list[Manifold]:
     """Short rails that tie the armrests' rear ends down to the seat."""
     return [
-        post((a * (x / 2 - 0.03), rear, top - 0.02), (a * x / 2, rear + 0.03, top + 0.2), 0.024, 0.024, 12)
+        post((a * (x / 2 - 0.06), rear, top - 0.02), (a * x / 2, rear + 0.03, top + 0.2), 0.024, 0.024, 12)
         for a in (-1, 1)
     ]
 

@@ -92,15 +92,13 @@ def _body(
     parts.append(sheared(rear, lean, low))
     parts += _arms(rng, x, y, low, rng.uniform(0.1, 0.26) + seat, arm, sides)
     edges, firm = np.linspace(left, right, count + 1), rng.uniform(3.5, 8)
-    ahead, crown, loose = -y / 2 - rng.uniform(0, 0.02), rng.uniform(3, 6), rng.random() < 0.7
+    ahead, edge, loose = -y / 2 - rng.uniform(0.005, 0.02), rng.uniform(0.02, 0.06), rng.random() < 0.7
     pads = rng.uniform(0.1, 0.16)
     kind = rng.choice(["plain", "tufted", "channels"], p=[0.55, 0.25, 0.2])
     for a, b in itertools.pairwise(edges):
         middle, wide = float(a + b) / 2, float(b - a) + 0.006
         long = y / 2 - deep - ahead + 0.02
-        parts.append(
-            cushion(wide, long, soft + 0.03, (middle, ahead + long / 2, base - 0.02), 12, crown, 0, 32)
-        )
+        parts.append(soft_box(wide, long, soft + 0.03, (middle, ahead + long / 2, base - 0.03), edge))
         if loose:
             rise = back - seat + rng.uniform(-0.06, 0.05)
             parts.append(
@@ -230,7 +228,7 @@ def pillow(rng: Rng) -> list[Manifold]:
         y = x if style in ("square", "round") else min(y, 0.8 * x)
         plan = 2.0 if style == "round" else rng.uniform(4, 9)
         pinch = 0.0 if style == "round" else rng.uniform(0.0, 0.14)
-        solid = cushion(x, y, z, (0, 0, -z / 2), plan, rng.uniform(1.5, 2.6), pinch, 56)
+        solid = cushion(x, y, z, (0, 0, -z / 2), plan, rng.uniform(1.8, 2.8), pinch, 56)
     if rng.random() < 0.45:
         count = int(rng.integers(1, 4))
         spots = np.column_stack([rng.uniform(-0.22, 0.22, (count, 2)) * (x, y), np.full(count, 0.5 * z)])
