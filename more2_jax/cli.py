@@ -62,13 +62,21 @@ class Run:
     """Unit of the scans' coordinates."""
     instance_property: str | None = None
     """Property of the points that names the instance, where it is none of the usual."""
+    segment: Literal["geometric"] | None = None
+    """geometric: cut a scan without masks into planes and clusters; masks from a network are better."""
     config: Path | None = None
     """YAML with values that replace the preset's."""
 
     def __call__(self) -> int:
         config = scene_config(self.preset, self.upright, self.config)
         scenes.run_scans(
-            self.scans, self.out, config, self.prior, unit=self.unit, instance_property=self.instance_property
+            self.scans,
+            self.out,
+            config,
+            self.prior,
+            unit=self.unit,
+            instance_property=self.instance_property,
+            segment=self.segment,
         )
         return 0
 
@@ -90,9 +98,11 @@ class Add:
     """Unit of the scan's coordinates."""
     instance_property: str | None = None
     """Property of the points that names the instance, where it is none of the usual."""
+    segment: Literal["geometric"] | None = None
+    """geometric: cut a scan without masks into planes and clusters; masks from a network are better."""
 
     def __call__(self) -> int:
-        scenes.add(self.folder, self.scan, self.prior, self.unit, self.instance_property)
+        scenes.add(self.folder, self.scan, self.prior, self.unit, self.instance_property, self.segment)
         return 0
 
 
@@ -109,11 +119,13 @@ class Inspect:
     """Unit of the scan's coordinates."""
     instance_property: str | None = None
     """Property of the points that names the instance, where it is none of the usual."""
+    segment: Literal["geometric"] | None = None
+    """geometric: cut a scan without masks into planes and clusters; masks from a network are better."""
     min_points: int = 64
     """Objects of fewer points are left out."""
 
     def __call__(self) -> int:
-        scenes.inspect(self.scan, self.unit, self.instance_property, self.min_points)
+        scenes.inspect(self.scan, self.unit, self.instance_property, self.min_points, self.segment)
         return 0
 
 

@@ -7,7 +7,7 @@ import sys
 import webbrowser
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from rich.markup import escape
 from rich.table import Table
@@ -19,6 +19,8 @@ if TYPE_CHECKING:
     from more2_jax.prior import Prior
     from more2_jax.types import LivingScene, Scan
 
+Segment = Literal["geometric"] | None
+
 
 def run_scans(
     paths: Sequence[Path],
@@ -28,6 +30,7 @@ def run_scans(
     *,
     unit: str = "m",
     instance_property: str | None = None,
+    segment: Segment = None,
 ) -> LivingScene:
     """Builds and saves the living scene of scans in time order; bad input is refused before long work."""
     from more2_jax.io import check_output, save_scene
@@ -39,7 +42,7 @@ def run_scans(
     check_output(out)
     session = Session()
     session.log(f"settings: preset {config.preset}, prior {prior_name}, upright {config.upright}")
-    scans = [_read(session, path, config, unit, instance_property) for path in paths]
+    scans = [_read(session, path, config, unit, instance_property, segment) for path in paths]
     keep_compiled_programs()
     prior = load_prior(prior_name)
     with session.stage(f"encoding {scans[0].name}"):
@@ -55,7 +58,14 @@ def run_scans(
     return scene
 
 
-def add(folder: Path, path: Path, prior_name: str | None, unit: str, instance_property: str | None) -> None:
+def add(
+    folder: Path,
+    path: Path,
+    prior_name: str | None,
+    unit: str,
+    instance_property: str | None,
+    segment: Segment = None,
+) -> None:
     """Adds one scan to a stored living scene; objects it does not show are left as they are."""
     from more2_jax.io import check_output, load_scene, save_scene
     from more2_jax.scene import add_scan, reconstruct
@@ -63,7 +73,7 @@ def add(folder: Path, path: Path, prior_name: str | None, unit: str, instance_pr
     scene, config = load_scene(folder)
     check_output(folder)
     session = Session()
-    scan = _read(session, path, config, unit, instance_property)
+    scan = _read(session, path, config, unit, instance_property, segment)
     keep_compiled_programs()
     prior = _same_prior(scene, prior_name)
     with session.stage(f"matching and registering {scan.name}"):
@@ -90,11 +100,22 @@ def _same_prior(scene: LivingScene, name: str | None) -> Prior:
 
 
 def _read(
-    session: Session, path: Path, config: SceneConfig, unit: str, instance_property: str | None
+    session: Session,
+    path: Path,
+    config: SceneConfig,
+    unit: str,
+    instance_property: str | None,
+    segment: Segment,
 ) -> Scan:
     from more2_jax.data.scans import read_scan
 
-    scan = read_scan(path, instance_property=instance_property, unit=unit, min_points=config.min_points)
+    scan = read_scan(
+        path,
+        instance_property=instance_property,
+        unit=unit,
+        min_points=config.min_points,
+        segment=segment,
+    )
     for warning in scan.warnings:
         session.warn(f"{scan.name}: {warning}")
     session.say(f"read {scan.source}: {len(scan.instances)} instances")
@@ -143,12 +164,16 @@ def demo(out: Path, config: SceneConfig, prior_name: str) -> None:
     session.say(summary)
 
 
-def inspect(path: Path, unit: str, instance_property: str | None, min_points: int) -> None:
+def inspect(
+    path: Path, unit: str, instance_property: str | None, min_points: int, segment: Segment = None
+) -> None:
     """Prints what a scan holds."""
     from more2_jax.data.inspection import format_report, inspect_scan
     from more2_jax.data.scans import read_scan
 
-    scan = read_scan(path, instance_property=instance_property, unit=unit, min_points=min_points)
+    scan = read_scan(
+        path, instance_property=instance_property, unit=unit, min_points=min_points, segment=segment
+    )
     Session().say(format_report(inspect_scan(scan)))
 
 

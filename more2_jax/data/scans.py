@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
@@ -10,10 +11,15 @@ from jaxtyping import Float
 
 from more2_jax.data.formats.registry import FORMATS, WITH_DEPTH_FRAMES
 from more2_jax.data.labelled import LabelledCloud, ReadOptions
+from more2_jax.data.segmentation import SegmentationConfig, segment_geometric
 from more2_jax.types import Instance, Scan, Skipped
 
 UNITS_M = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 SMALLEST_M, LARGEST_M = 0.02, 20.0  # a median object beyond these means another unit than was said
+MASKS_ARE_BETTER = (
+    "instances are clusters, found without a network: objects that touch are one. Masks from a network are"
+    " better: pass Mask3D's output with --masks, or name an instance property with --instance-property"
+)
 CM_OR_MM = 380.0  # between 120 and 1200, a chair in either
 
 
@@ -52,7 +58,32 @@ def read_scan(
         masks_needed=segment is None,
         depth_frames=depth_frames,
     )
-    return _scan(path, _read(path, options), unit, min_points)
+    if segment not in (None, "geometric"):
+        raise ValueError(f"segment {segment!r}; needed geometric or none")
+    cloud = _read(path, options)
+    if segment is not None:
+        cloud = _segmented(path, cloud, unit)
+    return _scan(path, cloud, unit, min_points)
+
+
+def _segmented(path: Path, cloud: LabelledCloud, unit: str) -> LabelledCloud:
+    """Clusters as instances where the cloud has none of its own; says what was done."""
+    if cloud.instance is not None:
+        said = "the scan has instance masks, so --segment geometric is not used"
+        return replace(cloud, warnings=(*cloud.warnings, said))
+    _check_points(path, cloud.points)
+    try:
+        found = segment_geometric(cloud.points * UNITS_M[cloud.unit or unit], SegmentationConfig())
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+    if not found.instance.any():
+        raise ValueError(f"{path}: no instances left after segmentation; {'; '.join(found.sentences())}")
+    return replace(
+        cloud,
+        instance=found.instance,
+        skipped=(*cloud.skipped, *found.skipped),
+        warnings=(*cloud.warnings, MASKS_ARE_BETTER, *found.sentences()),
+    )
 
 
 def _read(path: Path, options: ReadOptions) -> LabelledCloud:
@@ -66,17 +97,23 @@ def _read(path: Path, options: ReadOptions) -> LabelledCloud:
     raise ValueError(f"{path}: {what}; needed a .ply, an .npz, or a folder of one .ply per object")
 
 
+def _check_points(path: Path, points: Float[np.ndarray, "n 3"]) -> None:
+    if not len(points):
+        raise ValueError(f"{path}: no instances left; the scan has no points")
+    if bad := int((~np.isfinite(points).all(axis=1)).sum()):
+        raise ValueError(f"{path}: {bad} of {len(points)} points have NaN or infinite coordinates")
+
+
 # --- from labelled points to instances ----------------------------------------------------------------------
 
 
 def _scan(path: Path, cloud: LabelledCloud, unit: str, min_points: int) -> Scan:
     unit = cloud.unit or unit
     if cloud.instance is None:
-        raise ValueError(f"{path}: no instance masks; pass predicted ones with --masks")
-    if not len(cloud.points):
-        raise ValueError(f"{path}: no instances left; the scan has no points")
-    if bad := int((~np.isfinite(cloud.points).all(axis=1)).sum()):
-        raise ValueError(f"{path}: {bad} of {len(cloud.points)} points have NaN or infinite coordinates")
+        raise ValueError(
+            f"{path}: no instance masks; pass predicted ones with --masks, or --segment geometric"
+        )
+    _check_points(path, cloud.points)
     points = cloud.points * UNITS_M[unit]
     kept, skipped = _instances(cloud, points, min_points)
     if not kept:

@@ -8,6 +8,8 @@ import numpy as np
 
 from more2_jax.data.labelled import UNREADABLE, LabelledCloud, ReadOptions
 
+HOW = " (name the instances with --instance-property, or cut the scan with --segment geometric)"
+
 
 def recognises(path: Path) -> bool:
     """Whether this is an NPZ file, by its suffix."""
@@ -22,13 +24,14 @@ def read(path: Path, options: ReadOptions) -> LabelledCloud:
             names = ", ".join(file.files) or "nothing"
     except UNREADABLE as error:
         raise ValueError(f"{path}: not a readable NPZ file ({' '.join(str(error).split())})") from error
-    if missing := [k for k in ("points", key) if k not in arrays]:
-        raise ValueError(f"{path}: arrays are {names}; needed {' and '.join(missing)} too")
+    segmented = not options.masks_needed and options.instance_property is None
+    if missing := [k for k in ("points", *((key,) if not segmented else ())) if k not in arrays]:
+        raise ValueError(f"{path}: arrays are {names}; needed {' and '.join(missing)} too" + HOW)
     _check_npz(path, arrays, key)
     labels = arrays.get("label") if key != "label" else None
     return LabelledCloud(
         points=arrays["points"].astype(np.float64),
-        instance=arrays[key].astype(np.int64),
+        instance=arrays[key].astype(np.int64) if key in arrays else None,
         colors=_colors(arrays.get("color")),
         point_labels=labels,
     )

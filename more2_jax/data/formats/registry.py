@@ -11,6 +11,7 @@ from typing import Protocol
 
 from more2_jax.data.formats import (
     npz_scan,
+    pcd,
     ply_folder,
     ply_scan,
     replica,
@@ -42,6 +43,7 @@ FORMATS: tuple[Format, ...] = (
     s3dis,
     ply_scan,
     npz_scan,
+    pcd,
     ply_folder,
 )
 WITH_DEPTH_FRAMES: tuple[Format, ...] = (threerscan,)
