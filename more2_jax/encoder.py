@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
@@ -9,12 +11,16 @@ from jax import Array
 from jaxtyping import Bool, Float
 
 from more2_jax.config import EncoderConfig
+from more2_jax.neighbours import over_neighbours
 from more2_jax.types import Embedding
 from more2_jax.vn import (
     TINY,
     VNLA,
+    EdgeParts,
     EdgeVNLA,
+    VNLAWeights,
     channel_normalise,
+    edge_vnla,
     kernel_init,
     masked_mean,
     nearest_features,
@@ -23,13 +29,11 @@ from more2_jax.vn import (
 )
 
 Features = Float[Array, "n 3 c"]
-Edges = Float[Array, "n k 3 c"]
 
 
-def mean_over_neighbours(edges: Edges, real: Bool[Array, "n k"]) -> Features:
-    """Mean over the neighbours that are real."""
-    weight = real / jnp.maximum(real.sum(axis=-1, keepdims=True), 1)
-    return jnp.einsum("nk,nk...->n...", weight.astype(edges.dtype), edges)
+def divide_by_count(total: Features, real: Bool[Array, "n k"]) -> Features:
+    """The mean over the real neighbours, from the sum over them."""
+    return total / jnp.maximum(real.sum(axis=-1), 1)[:, None, None]
 
 
 def power_of_two(x: Float[Array, ""]) -> Float[Array, ""]:
@@ -49,12 +53,19 @@ class FirstBlock(nn.Module):
 
     @nn.compact
     def __call__(self, points: Float[Array, "n 3"], mask: Bool[Array, "n"]) -> Features:
-        index, real = nearest_features(points[..., None], points[..., None], mask, self.config.neighbours)
-        neighbour, own = points[index], jnp.broadcast_to(points[:, None], (*index.shape, 3))
+        c = self.config
+        index, real = nearest_features(points[..., None], points[..., None], mask, c.neighbours)
         length = jnp.sqrt(jnp.maximum(jnp.sum(points**2, axis=-1), TINY))
-        unit = (points / length[:, None])[:, None]
-        graph = jnp.stack([jnp.cross(unit, neighbour), neighbour - own, own], axis=-1)
-        return mean_over_neighbours(VNLA(self.config.widths[0], self.config.leak, name="value")(graph), real)
+        weights = VNLAWeights(3, c.widths[0], name="value")()
+
+        def edge(neighbour: Array, own: tuple[Array, Array], shared: tuple[Array, Array], real: Array) -> Any:
+            unit, point = own
+            graph = jnp.stack([jnp.cross(unit, neighbour), neighbour - point, point], axis=-1)
+            q = graph @ shared[0]
+            return real[:, None, None] * vn_leaky_relu(q, q @ shared[1], c.leak), ()
+
+        own, counted = (points / length[:, None], points), real.T.astype(points.dtype)
+        return divide_by_count(over_neighbours(edge, points, own, weights, counted, index)[0], real)
 
 
 class LinearBlock(nn.Module):
@@ -67,9 +78,15 @@ class LinearBlock(nn.Module):
     def __call__(
         self, source: Float[Array, "m 3 i"], mask: Bool[Array, "m"], query: Float[Array, "n 3 i"]
     ) -> Features:
-        index, real = nearest_features(query, source, mask, self.config.neighbours)
-        edges = EdgeVNLA(self.features, self.config.leak, name="value")(source, query, index)
-        return mean_over_neighbours(edges, real)
+        c = self.config
+        index, real = nearest_features(query, source, mask, c.neighbours)
+        of_neighbour, of_self = EdgeVNLA(self.features, name="value")(source, query)
+        counted = real.T.astype(query.dtype)
+
+        def edge(neighbour: EdgeParts, own: EdgeParts, _: tuple[()], real: Array) -> Any:
+            return real[:, None, None] * edge_vnla(neighbour, own, c.leak), ()
+
+        return divide_by_count(over_neighbours(edge, of_neighbour, of_self, (), counted, index)[0], real)
 
 
 class AttentionBlock(nn.Module):
@@ -89,11 +106,23 @@ class AttentionBlock(nn.Module):
         c = self.config
         index, real = nearest_features(query, source, mask, c.neighbours)
         asked = channel_normalise(VNLA(self.features, c.leak, name="query")(query))
-        key = channel_normalise(EdgeVNLA(self.features, c.leak, name="key")(source, query, index))
-        value = EdgeVNLA(self.features, c.leak, name="value")(source, query, index)
-        weight = attention_weights(asked, key, real, c.head_channels)
-        mixed = jnp.einsum("nkh,nkxhc->nxhc", weight, by_head(value, c.head_channels))
-        mixed = mixed.reshape(*mixed.shape[:-2], self.features)
+        key, own_key = EdgeVNLA(self.features, name="key")(source, query)
+        value, own_value = EdgeVNLA(self.features, name="value")(source, query)
+
+        def score(neighbour: EdgeParts, own: tuple[Array, EdgeParts], _: tuple[()], __: tuple[()]) -> Any:
+            asked, parts = own
+            product = asked * channel_normalise(edge_vnla(neighbour, parts, c.leak))
+            return (), by_head(product, c.head_channels).sum(axis=(-3, -1))
+
+        _, logit = over_neighbours(score, key, (asked, own_key), (), (), index)
+        logit = logit / jnp.sqrt(3.0 * c.head_channels)
+        weight = jax.nn.softmax(logit, axis=0, where=real.T[..., None])
+
+        def weighted(neighbour: EdgeParts, own: EdgeParts, _: tuple[()], weight: Array) -> Any:
+            by_channel = jnp.repeat(weight, c.head_channels, axis=-1)
+            return by_channel[:, None, :] * edge_vnla(neighbour, own, c.leak), ()
+
+        mixed, _ = over_neighbours(weighted, value, own_value, (), weight, index)
         context = jnp.broadcast_to(masked_mean(mixed, query_mask), mixed.shape)
         return VNLA(self.features, c.leak, name="context")(jnp.concatenate([mixed, context], axis=-1))
 
@@ -101,14 +130,6 @@ class AttentionBlock(nn.Module):
 def by_head(x: Float[Array, "*b 3 c"], channels: int) -> Float[Array, "*b 3 heads channels"]:
     """Splits the channels into heads."""
     return x.reshape(*x.shape[:-1], -1, channels)
-
-
-def attention_weights(
-    query: Features, key: Edges, real: Bool[Array, "n k"], channels: int
-) -> Float[Array, "n k heads"]:
-    """Softmax over the real neighbours of ⟨Q, K⟩ / √(3·channels), a head at a time."""
-    logit = jnp.einsum("nxhc,nkxhc->nkh", by_head(query, channels), by_head(key, channels))
-    return jax.nn.softmax(logit / jnp.sqrt(3.0 * channels), axis=1, where=real[..., None])
 
 
 class Center(nn.Module):
