@@ -20,7 +20,6 @@ Tree = Any  # of arrays
 Edge = Callable[[Tree, Tree, Tree, Tree], tuple[Tree, Tree]]
 
 
-@partial(jax.custom_vjp, nondiff_argnums=(0,))
 def over_neighbours(
     edge: Edge, source: Tree, own: Tree, shared: Tree, each: Tree, index: Int[Array, "n k"]
 ) -> tuple[Tree, Tree]:
@@ -29,9 +28,11 @@ def over_neighbours(
     `source` has a row a point to choose from, `own` a row a point, `shared` is the same for all, `each` has a
     leading axis of k. Returns the sum of the a and the stack (k, n, …) of the b; either may be empty.
     """
-    return _scan(edge, source, own, shared, each, index)
+    result: tuple[Tree, Tree] = _scan(edge, source, own, shared, each, index)  # pyright: ignore[reportAssignmentType]
+    return result
 
 
+@partial(jax.custom_vjp, nondiff_argnums=(0,))
 def _scan(
     edge: Edge, source: Tree, own: Tree, shared: Tree, each: Tree, index: Int[Array, "n k"]
 ) -> tuple[Tree, Tree]:
@@ -74,4 +75,4 @@ def _backward(edge: Edge, kept: tuple[Tree, ...], gradient: tuple[Tree, Tree]) -
     return d_source, d_own, d_shared, d_each, None
 
 
-over_neighbours.defvjp(_forward, _backward)
+_scan.defvjp(_forward, _backward)

@@ -42,11 +42,16 @@ def dot(a: Float[Array, "*b 3 c"], b: Float[Array, "*b 3 d"]) -> Float[Array, "*
     return (x + y + z)[..., None, :]
 
 
-@partial(jax.custom_vjp, nondiff_argnums=(2,))
 def vn_leaky_relu(
     q: Float[Array, "*b 3 c"], k: Float[Array, "*b 3 d"], leak: float
 ) -> Float[Array, "*b 3 c"]:
     """Where ⟨q, k⟩ < 0, takes (1 − leak) of the part of q along k away. `d` is c, or 1 to share a direction."""
+    result: Array = _leaky(q, k, leak)  # pyright: ignore[reportAssignmentType]
+    return result
+
+
+@partial(jax.custom_vjp, nondiff_argnums=(2,))
+def _leaky(q: Array, k: Array, leak: float) -> Array:
     length = dot(k, k)
     # A zero direction removes nothing; dividing by 1 there keeps the gradient finite.
     share = jnp.minimum(dot(q, k), 0.0) / jnp.where(length > NO_DIRECTION, length, 1.0)
@@ -74,7 +79,7 @@ def _leaky_backward(leak: float, kept: tuple[Array, Array], g: Array) -> tuple[A
     return g - of_share * k, of_k
 
 
-vn_leaky_relu.defvjp(_leaky_forward, _leaky_backward)
+_leaky.defvjp(_leaky_forward, _leaky_backward)
 
 
 class VNLAWeights(nn.Module):
