@@ -97,6 +97,18 @@ def test_faces_of_no_corners_read(tmp_path):
     np.testing.assert_array_equal(mesh.face, [1, 1, 1])
 
 
+def test_what_was_read_does_not_change_with_the_file(tmp_path):
+    file = write_ply(tmp_path / "a.ply", vertex_columns(POINTS), QUADS, face_columns={"object_id": OBJECT})
+    mesh = read_ply_mesh(file)
+    size = file.stat().st_size
+    with file.open("r+b") as stream:
+        stream.seek(size // 4)
+        stream.write(b"\xff" * (size - size // 4))
+    np.testing.assert_array_equal(mesh.cloud.points, POINTS)
+    np.testing.assert_array_equal(mesh.corners, QUADS.ravel())
+    np.testing.assert_array_equal(mesh.face_properties["object_id"], OBJECT)
+
+
 # --- S3DIS ---------------------------------------------------------------------------------------------------
 
 

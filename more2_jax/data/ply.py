@@ -9,8 +9,11 @@ import numpy as np
 from jaxtyping import Float, Int
 from plyfile import PlyData, PlyParseError
 
+from more2_jax.data.labelled import one_line
+
 INSTANCE_PROPERTIES = ("instance", "instance_id", "objectId", "object_id", "label")
 COLOR_PROPERTIES = ("red", "green", "blue")
+CORNERS = ("vertex_indices", "vertex_index")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,26 +42,47 @@ def read_ply(path: Path) -> PlyCloud:
 
     Raises ValueError, in one line, when the file is not a PLY, is truncated, or its vertices lack x, y or z.
     """
-    with path.open("rb") as file:
-        if file.readline(16).strip() != b"ply":
-            raise ValueError(f"{path}: not a PLY file; needed one that begins with the line 'ply'")
-    vertices = _vertices(path)
+    return cloud_of(path, read_elements(path))
+
+
+def cloud_of(path: Path, elements: PlyData) -> PlyCloud:
+    """The vertices among the elements of a file. ValueError, in one line, if they lack x, y or z."""
+    if "vertex" not in elements:
+        raise ValueError(f"{path}: no 'vertex' element; needed a PLY of points")
+    vertices = elements["vertex"].data
     names = vertices.dtype.names or ()
     if missing := [axis for axis in "xyz" if axis not in names]:
         raise ValueError(
             f"{path}: vertices have {', '.join(names) or 'nothing'}; needed {', '.join(missing)} too"
         )
-    scalars = {name: vertices[name] for name in names if vertices.dtype[name].kind in "iuf"}
-    points = np.stack([np.asarray(scalars.pop(axis), np.float64) for axis in "xyz"], axis=-1)
+    # Copies: the elements may be a map of the file.
+    scalars = {name: np.array(vertices[name]) for name in names if vertices.dtype[name].kind in "iuf"}
+    if missing := [axis for axis in "xyz" if axis not in scalars]:
+        raise ValueError(f"{path}: {', '.join(missing)} of the vertices are lists; needed numbers")
+    with np.errstate(invalid="ignore"):  # a signalling NaN: refused where coordinates are checked
+        points = np.stack([scalars.pop(axis).astype(np.float64) for axis in "xyz"], axis=-1)
     return PlyCloud(points=points, properties=scalars)
 
 
-def _vertices(path: Path) -> np.ndarray:
+def read_elements(path: Path) -> PlyData:
+    """All elements of a PLY file. ValueError, in one line, when it is no PLY, is truncated or damaged.
+
+    Faces of equally many corners are mapped at once; those of mixed meshes are read list by list, which is slow.
+    """
     try:
-        elements = PlyData.read(str(path), mmap=False)  # pyright: ignore[reportArgumentType]
-    except (PlyParseError, ValueError, UnicodeDecodeError, EOFError, OverflowError, MemoryError) as error:
-        reason = " ".join(str(error).split()) or type(error).__name__
-        raise ValueError(f"{path}: truncated or damaged PLY ({reason}); needed a complete file") from error
-    if "vertex" not in elements:
-        raise ValueError(f"{path}: no 'vertex' element; needed a PLY of points")
-    return elements["vertex"].data
+        with path.open("rb") as file:
+            first = file.readline(16).strip()
+    except OSError as error:
+        raise ValueError(f"{path}: not readable ({one_line(error)})") from error
+    if first != b"ply":
+        raise ValueError(f"{path}: not a PLY file; needed one that begins with the line 'ply'")
+    reason: Exception = ValueError("no reason")
+    for corners in (3, 4, None):
+        known = {} if corners is None else {"face": dict.fromkeys(CORNERS, corners)}
+        try:
+            return PlyData.read(str(path), known_list_len=known)
+        except (PlyParseError, ValueError, TypeError, EOFError, OverflowError, MemoryError, OSError) as error:
+            reason = error
+    raise ValueError(
+        f"{path}: truncated or damaged PLY ({one_line(reason)}); needed a complete file"
+    ) from reason

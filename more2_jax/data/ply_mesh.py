@@ -7,11 +7,9 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Int
-from plyfile import PlyData, PlyElement, PlyListProperty, PlyParseError
+from plyfile import PlyListProperty
 
-from more2_jax.data.ply import PlyCloud, read_ply
-
-CORNERS = ("vertex_indices", "vertex_index")
+from more2_jax.data.ply import CORNERS, PlyCloud, cloud_of, read_elements
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,14 +28,21 @@ def read_ply_mesh(path: Path) -> PlyMesh:
     Raises ValueError, in one line, when the file is no PLY, is damaged, has no faces, or a face has a corner
     that is no vertex.
     """
-    cloud = read_ply(path)
-    faces = _faces(path)
+    elements = read_elements(path)
+    cloud = cloud_of(path, elements)
+    if "face" not in elements:
+        raise ValueError(f"{path}: no 'face' element; needed a mesh")
+    faces = elements["face"]
     name = next((p.name for p in faces.properties if p.name in CORNERS), None)
     if name is None or not isinstance(faces.ply_property(name), PlyListProperty):
         raise ValueError(f"{path}: faces have no list {' or '.join(CORNERS)}; needed their corners")
     lists = faces.data[name]
-    sizes = np.array([len(corners) for corners in lists], np.int64)
-    corners = np.concatenate([np.zeros(0, np.int64), *lists]) if lists.dtype == object else lists.ravel()
+    if lists.dtype == object:  # mixed: an array a face
+        sizes = np.array([len(corners) for corners in lists], np.int64)
+        corners = np.concatenate([np.zeros(0, np.int64), *lists])
+    else:
+        sizes = np.full(len(lists), lists.shape[1], np.int64)
+        corners = np.array(lists).ravel()
     if corners.dtype.kind not in "iu":
         raise ValueError(f"{path}: corners of faces are {corners.dtype}; needed whole numbers")
     corners = corners.astype(np.int64)
@@ -50,20 +55,3 @@ def read_ply_mesh(path: Path) -> PlyMesh:
         face=np.repeat(np.arange(len(sizes)), sizes),
         face_properties={n: np.array(faces.data[n]) for n in names if faces.data.dtype[n].shape == ()},
     )
-
-
-def _faces(path: Path) -> PlyElement:
-    """Faces of equally many corners are read at once; only mixed ones list by list, which is slow."""
-    reason: Exception | None = None
-    for corners in (4, 3, None):
-        known = {} if corners is None else {"face": dict.fromkeys(CORNERS, corners)}
-        try:
-            elements = PlyData.read(str(path), mmap=corners is not None, known_list_len=known)  # pyright: ignore[reportArgumentType]
-        except (PlyParseError, ValueError, EOFError, OverflowError, MemoryError, OSError) as error:
-            reason = error
-            continue
-        if "face" not in elements:
-            raise ValueError(f"{path}: no 'face' element; needed a mesh")
-        return elements["face"]
-    what = " ".join(str(reason).split()) or type(reason).__name__
-    raise ValueError(f"{path}: truncated or damaged PLY ({what}); needed a complete file") from reason

@@ -73,8 +73,12 @@ def _names(folder: Path) -> frozenset[str]:
 
 def _folder_loader(folder: Path) -> Callable[[str], bytes]:
     def load(name: str) -> bytes:
-        with (folder / name).open("rb") as file:
-            return _bounded(file.read(LARGEST_FILE + 1), f"{folder}: {name}")
+        try:
+            with (folder / name).open("rb") as file:
+                content = file.read(LARGEST_FILE + 1)
+        except OSError as error:
+            raise ValueError(f"{folder}: {name} is not readable ({one_line(error)})") from error
+        return _bounded(content, f"{folder}: {name}")
 
     return load
 

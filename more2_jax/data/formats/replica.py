@@ -84,8 +84,11 @@ def _points_of_objects(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Vertices and instances of the points: each vertex once for every instance whose faces touch it."""
     instance = np.where(np.isin(objects, list(classes)), objects + shift, 0)
-    pairs = np.unique(np.stack([instance, corners], axis=-1), axis=0)
-    return pairs[:, 1], pairs[:, 0]
+    count = corners.max(initial=0) + 1
+    pairs = np.unique(
+        instance * count + corners
+    )  # fits: instances have 31 bits, vertices fewer than a file's bytes
+    return pairs % count, pairs // count
 
 
 def _candidates(path: Path) -> tuple[Path, ...]:

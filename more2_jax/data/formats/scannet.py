@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from more2_jax.data.formats import ply_scan
-from more2_jax.data.labelled import LabelledCloud, ReadOptions
+from more2_jax.data.labelled import LabelledCloud, ReadOptions, one_line
 from more2_jax.data.ply import read_ply
 from more2_jax.data.segment_groups import instances_of, read_groups, read_segment_indices
 from more2_jax.data.structural import drop_background
@@ -60,7 +60,11 @@ def read(path: Path, options: ReadOptions) -> LabelledCloud:
 def axis_alignment(path: Path) -> Float[np.ndarray, "4 4"]:
     """`T_aligned_mesh` of a scene (its folder or mesh) from `<scene>.txt`: 16 numbers, row-major, metres."""
     info = _beside(_mesh(path), ".txt")
-    for line in info.read_text(encoding="utf-8", errors="replace").splitlines():
+    try:
+        text = info.read_text(encoding="utf-8", errors="replace")
+    except OSError as error:
+        raise ValueError(f"{info}: not readable ({one_line(error)})") from error
+    for line in text.splitlines():
         name, _, value = line.partition("=")
         if name.strip() == "axisAlignment":
             return _matrix(info, value)
