@@ -98,7 +98,8 @@ def test_faces_of_no_corners_read(tmp_path):
 
 
 def test_what_was_read_does_not_change_with_the_file(tmp_path):
-    file = write_ply(tmp_path / "a.ply", vertex_columns(POINTS), QUADS, face_columns={"object_id": OBJECT})
+    objects = OBJECT.astype("u2")
+    file = write_ply(tmp_path / "a.ply", vertex_columns(POINTS), QUADS, face_columns={"object_id": objects})
     mesh = read_ply_mesh(file)
     size = file.stat().st_size
     with file.open("r+b") as stream:

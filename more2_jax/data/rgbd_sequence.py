@@ -21,7 +21,8 @@ from more2_jax.data.labelled import UNREADABLE, one_line
 INFO, DEPTH, POSE = "_info.txt", ".depth.pgm", ".pose.txt"
 LARGEST_FILE = 4 * 2**20  # bytes of a frame: two million pixels, 50 times what the sensor has
 RIGID = 1e-2  # how far a tracked rotation, rounded in the file, may be from one
-PGM = re.compile(rb"P5(?:\s+|#[^\n]*\n)+?(\d{1,6})(?:\s+|#[^\n]*\n)+?(\d{1,6})(?:\s+|#[^\n]*\n)+?(\d{1,5})\s")
+GAP = rb"(?:\s|#[^\n]*\n)+"  # blanks and comments
+PGM = re.compile(rb"P5" + GAP + rb"(\d{1,6})" + GAP + rb"(\d{1,6})" + GAP + rb"(\d{1,5})\s")
 
 
 @dataclass(frozen=True, kw_only=True)
