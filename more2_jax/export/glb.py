@@ -1,0 +1,112 @@
+"""glTF binary: one named node an object, and an animation that goes through the scans, a second each."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+from jaxtyping import Float
+from trimesh.exchange.gltf import export_glb
+from trimesh.visual import TextureVisuals
+from trimesh.visual.material import PBRMaterial
+
+from more2_jax.export.placing import Track, placed, quaternions, track
+from more2_jax.report import rgb
+from more2_jax.types import LivingScene, SceneObject
+
+ROOT = "living_scene"  # the node that holds all objects and turns z up into glTF's y up
+SECONDS_PER_SCAN = 1.0
+T_YUP_ZUP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+FLOAT = 5126  # glTF's componentType of float32
+
+Channels = dict[str, tuple[Float[np.ndarray, "scans _"], str]]  # path → values, interpolation
+
+
+def write_glb(scene: LivingScene, path: Path, scan: int) -> None:
+    """Objects as nodes under `ROOT`; at rest as in `scan`, in the animation `scans` as in scan t at t seconds.
+
+    An object that is absent has scale 0, in steps: glTF has no other visibility that every viewer knows.
+    Positions are relative to the scene's middle, which `ROOT` holds in double precision.
+    """
+    middle = np.mean(
+        [T_scan_ref @ [*o.points.mean(axis=0), 1.0] for _, o, T_scan_ref in placed(scene, scan)], 0
+    )
+    T_middle_scan = trimesh.transformations.translation_matrix(-middle[:3])
+    graph = trimesh.Scene()
+    graph.graph.update(
+        frame_from=graph.graph.base_frame, frame_to=ROOT, matrix=T_YUP_ZUP @ np.linalg.inv(T_middle_scan)
+    )
+    channels: dict[str, Channels] = {}
+    for k, o in enumerate(scene.objects):
+        node = track(o, len(scene.scans))
+        graph.add_geometry(_shape(o, k, node), node_name=o.id, geom_name=o.id, parent_node_name=ROOT)
+        channels[o.id] = _channels(node, T_middle_scan)
+    labels = {o.id: o.label for o in scene.objects}
+    path.write_bytes(export_glb(graph, buffer_postprocessor=_animator(channels, labels, scan)))
+
+
+def _shape(o: SceneObject, number: int, node: Track) -> trimesh.PointCloud | trimesh.Trimesh:
+    paint = [*rgb(number), 255]
+    if o.mesh is None:
+        return trimesh.PointCloud(node.vertices, colors=np.tile(paint, (len(node.vertices), 1)))
+    shape = trimesh.Trimesh(node.vertices, o.mesh.faces, process=False)
+    shape.visual = TextureVisuals(
+        material=PBRMaterial(
+            name=o.id, baseColorFactor=paint, metallicFactor=0.0, roughnessFactor=0.8, doubleSided=True
+        )
+    )
+    return shape
+
+
+def _channels(node: Track, T_middle_scan: Float[np.ndarray, "4 4"]) -> Channels:
+    """What the node does at every scan."""
+    poses = T_middle_scan @ node.T_scan_node
+    return {
+        "translation": (poses[:, :3, 3], "LINEAR"),
+        "rotation": (quaternions(poses), "LINEAR"),
+        "scale": (np.repeat(node.present[:, None].astype(float), 3, axis=1), "STEP"),
+    }
+
+
+def _animator(
+    channels: dict[str, Channels], labels: dict[str, str | None], scan: int
+) -> Callable[[dict[str, bytes], dict[str, Any]], None]:
+    """What trimesh calls with its buffers and glTF tree before it packs them: adds poses and the animation."""
+
+    def add(buffers: dict[str, bytes], tree: dict[str, Any]) -> None:
+        scans = len(next(iter(channels.values()))["scale"][0])
+        times = _accessor(buffers, tree, "times", SECONDS_PER_SCAN * np.arange(scans))
+        animation: dict[str, Any] = {"name": "scans", "samplers": [], "channels": []}
+        for index, node in enumerate(tree["nodes"]):
+            if (name := node.get("name")) not in channels:
+                continue
+            node.pop("matrix", None)  # an animated node has translation, rotation, scale instead
+            node["extras"] = {"id": name, "label": labels[name]}
+            for path, (values, interpolation) in channels[name].items():
+                node[path] = values[scan].tolist()
+                output = _accessor(buffers, tree, f"{name} {path}", values)
+                target = {"sampler": len(animation["samplers"]), "target": {"node": index, "path": path}}
+                animation["channels"].append(target)
+                sampler = {"input": times, "output": output, "interpolation": interpolation}
+                animation["samplers"].append(sampler)
+        tree["animations"] = [animation]
+
+    return add
+
+
+def _accessor(buffers: dict[str, bytes], tree: dict[str, Any], key: str, values: np.ndarray) -> int:
+    """Appends float32 values to the file's buffer; returns the number of their accessor."""
+    values = values.astype("<f4")
+    buffers[key] = values.tobytes()
+    tree["accessors"][key] = {
+        "bufferView": len(buffers) - 1,
+        "componentType": FLOAT,
+        "count": len(values),
+        "type": {1: "SCALAR", 3: "VEC3", 4: "VEC4"}[1 if values.ndim == 1 else values.shape[1]],
+        "min": values.min(axis=0, keepdims=values.ndim == 1).tolist(),
+        "max": values.max(axis=0, keepdims=values.ndim == 1).tolist(),
+    }
+    return len(tree["accessors"]) - 1

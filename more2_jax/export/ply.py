@@ -1,0 +1,20 @@
+"""PLY: the accumulated points of all objects as one scan shows them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from more2_jax.export.placing import placed
+from more2_jax.meshfile import write_points
+from more2_jax.metrics import apply_pose
+from more2_jax.types import LivingScene
+
+
+def write_ply(scene: LivingScene, path: Path, scan: int) -> None:
+    """Points in the frame of `scan`, metres, z up; the vertex property `object` is the object's number."""
+    there = placed(scene, scan)
+    points = np.concatenate([apply_pose(T_scan_ref, o.points) for _, o, T_scan_ref in there])
+    numbers = np.repeat([k for k, _, _ in there], [len(o.points) for _, o, _ in there])
+    write_points(path, points, numbers, "object")

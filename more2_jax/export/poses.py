@@ -1,0 +1,17 @@
+"""JSON: poses and changes, without geometry."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from more2_jax.io import scene_to_json
+from more2_jax.types import LivingScene
+
+
+def write_poses(scene: LivingScene, path: Path, scan: int) -> None:
+    """What scene.json holds, less the names of files beside it; `scan` chooses nothing, all scans are written."""
+    content = scene_to_json(scene)
+    objects = [{k: v for k, v in o.items() if k not in ("mesh", "points")} for o in content.pop("objects")]
+    text = json.dumps(content | {"up_axis": "z", "objects": objects}, indent=1, allow_nan=False)
+    path.write_text(text + "\n", encoding="utf-8")
