@@ -26,15 +26,19 @@ def farthest_points(
     points = jnp.where(
         mask[:, None], points, 0.0
     )  # whatever stands in masked rows, even NaN, goes no further
-    fixed = jax.lax.stop_gradient(points)
+    x, y, z = fixed = jax.lax.stop_gradient(points).T
+    row = jnp.arange(len(points), dtype=jnp.int32)
 
     def body(carry: tuple[Array, Array], _: None) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
         nearest, chosen = carry
-        offset = fixed - fixed[chosen]
-        nearest = jnp.minimum(nearest, jnp.sum(offset * offset, axis=-1))
-        return (nearest, jnp.argmax(nearest)), (chosen, jnp.max(nearest) > 0)
+        at = fixed[:, chosen]
+        nearest = jnp.minimum(nearest, (x - at[0]) ** 2 + (y - at[1]) ** 2 + (z - at[2]) ** 2)
+        # The first row of the maximum, as argmax finds it; two plain reductions are many times faster on a CPU.
+        most = jnp.max(nearest)
+        first = jnp.min(jnp.where(nearest == most, row, len(points) - 1))
+        return (nearest, first), (chosen, most > 0)
 
-    start = (jnp.where(mask, jnp.inf, -1.0).astype(points.dtype), jnp.argmax(mask))
+    start = (jnp.where(mask, jnp.inf, -1.0).astype(points.dtype), jnp.argmax(mask).astype(jnp.int32))
     _, (index, more) = jax.lax.scan(body, start, length=count)
     real = jnp.concatenate([jnp.any(mask)[None], more[:-1]])
     return points[index], real
