@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 from dataset_writers.scannet import write_scannet, write_scannetpp
 
+from more2_jax.data.formats import scannetpp
 from more2_jax.data.formats.scannet import axis_alignment
+from more2_jax.data.labelled import ReadOptions
 from more2_jax.data.scans import read_scan
 from more2_jax.data.structural import BACKGROUND_LABELS, is_background, normalised
 from more2_jax.data.threerscan_index import CATEGORIES
@@ -87,6 +89,20 @@ def test_a_missing_file_is_named(tmp_path, missing, message):
     (mesh.parent / f"scene0001_00{missing}").unlink()
     with pytest.raises(ValueError, match=message):
         read_scan(mesh)
+
+
+def test_a_scene_without_annotation_is_cut_and_one_with_it_is_not(tmp_path):
+    """`segment` is for scans without masks: the annotation, where there is one, is kept."""
+    seen = read_scan(write_scannet(tmp_path / "scene0001_00", POINTS, SEGMENTS, GROUPS), segment="geometric")
+    assert [i.id for i in seen.instances] == [1, 2, 6]
+    pp = write_scannetpp(tmp_path / "3db0a1c8f3", POINTS, SEGMENTS, GROUPS[:1])
+    assert len(read_scan(pp, segment="geometric").instances) == 1
+    options = ReadOptions(masks_needed=False)
+    for name in ("segments.json", "segments_anno.json"):
+        (pp / "scans" / name).unlink()
+    cloud = scannetpp.read(pp, options)
+    assert cloud.instance is None
+    np.testing.assert_array_equal(cloud.points, POINTS)
 
 
 DAMAGE = {

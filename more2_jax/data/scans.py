@@ -37,12 +37,11 @@ def read_scan(
 
     `path` is a PLY whose vertices carry an integer property naming the instance (`instance`, `instance_id`,
     `objectId`, `object_id` or `label`, in this order; `instance_property` names another), an NPZ with
-    `points` (n, 3), `instance` (n,) and optional `label` (n,), `color` (n, 3), a folder of one PLY per
-    object, or another of `more2_jax.data.formats.registry`. Instance ids ≤ 0 are background. `unit` is the file's: m,
-    cm or mm. Instances of fewer than `min_points` points are reported in `Scan.skipped`; sizes that look like
-    another unit, in `Scan.warnings`. `masks` are predicted ones beside the cloud; `segment="geometric"` cuts
-    a cloud that has none into planes and clusters. `depth_frames` takes the points of a 3RScan folder from its
-    raw depth rather than from its mesh (METHOD 8).
+    `points` (n, 3), `instance` (n,) and optional `label` (n,), `color` (n, 3), a folder of one PLY per object,
+    or another of `data.formats.registry`. Instance ids ≤ 0 are background. `unit` is the file's: m, cm or mm.
+    Instances of fewer than `min_points` points are reported in `Scan.skipped`; sizes that look like another
+    unit, in `Scan.warnings`. `masks` are predicted ones beside the cloud; `segment="geometric"` cuts a cloud
+    that has none into planes and clusters; `depth_frames` reads the raw depth of 3RScan, not its mesh (METHOD 8).
 
     Raises ValueError, in one line, when the file is missing, unknown, damaged, has no instance property, has
     coordinates that are not finite, or no instance is left.

@@ -33,7 +33,7 @@ def read(path: Path, options: ReadOptions) -> LabelledCloud:
     """
     file = next(file for file in _candidates(path) if file.is_file())
     mesh = read_ply_mesh(file)
-    if options.masks is not None or not options.masks_needed:
+    if options.masks or not (options.masks_needed or file.with_name(CLASSES).is_file()):
         return LabelledCloud(points=mesh.cloud.points, instance=None, colors=mesh.cloud.colors, unit="m")
     objects = mesh.face_properties.get(OBJECT)
     if objects is None or objects.dtype.kind not in "iu":

@@ -27,7 +27,7 @@ def read(path: Path, options: ReadOptions) -> LabelledCloud:
     """
     mesh = next(file for file in _candidates(path) if file.is_file())
     cloud = read_ply(mesh)
-    if options.masks is not None or not options.masks_needed:
+    if options.masks or not (options.masks_needed or mesh.with_name(ANNOTATION).is_file()):
         return LabelledCloud(points=cloud.points, instance=None, colors=cloud.colors, unit="m")
     for name in (SEGMENTS, ANNOTATION):
         if not mesh.with_name(name).is_file():
