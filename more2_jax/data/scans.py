@@ -11,6 +11,7 @@ from jaxtyping import Float
 
 from more2_jax.data.formats.registry import FORMATS, WITH_DEPTH_FRAMES
 from more2_jax.data.labelled import LabelledCloud, ReadOptions
+from more2_jax.data.masks import lay_masks
 from more2_jax.data.segmentation import SegmentationConfig, segment_geometric
 from more2_jax.types import Instance, Scan, Skipped
 
@@ -30,6 +31,7 @@ def read_scan(
     unit: str = "m",
     min_points: int = 64,
     masks: str | Path | None = None,
+    min_score: float = 0.5,
     segment: Literal["geometric"] | None = None,
     depth_frames: bool = False,
 ) -> Scan:
@@ -40,26 +42,28 @@ def read_scan(
     `points` (n, 3), `instance` (n,) and optional `label` (n,), `color` (n, 3), a folder of one PLY per object,
     or another of `data.formats.registry`. Instance ids ≤ 0 are background. `unit` is the file's: m, cm or mm.
     Instances of fewer than `min_points` points are reported in `Scan.skipped`; sizes that look like another
-    unit, in `Scan.warnings`. `masks` are predicted ones beside the cloud; `segment="geometric"` cuts a cloud
-    that has none into planes and clusters; `depth_frames` reads the raw depth of 3RScan, not its mesh (METHOD 8).
+    unit, in `Scan.warnings`. `masks` are predicted ones (`data.masks`): those scored `min_score` or more replace
+    the scan's own. `segment="geometric"` cuts a cloud without instances into planes and clusters; `depth_frames`
+    reads the raw depth of 3RScan, not its mesh (METHOD 8).
 
     Raises ValueError, in one line, when the file is missing, unknown, damaged, has no instance property, has
     coordinates that are not finite, or no instance is left.
     """
     path = Path(path)
-    if unit not in UNITS_M:
-        raise ValueError(f"unit {unit!r}; needed one of {', '.join(UNITS_M)}")
+    if unit not in UNITS_M or segment not in (None, "geometric"):
+        units = ", ".join(UNITS_M)
+        raise ValueError(f"unit {unit!r}, segment {segment!r}; needed one of {units}; geometric or None")
     if not path.exists():
         raise ValueError(f"{path}: no such file or folder")
     options = ReadOptions(
         instance_property=instance_property,
         masks=None if masks is None else Path(masks),
-        masks_needed=segment is None,
+        masks_needed=segment is None and masks is None,
         depth_frames=depth_frames,
     )
-    if segment not in (None, "geometric"):
-        raise ValueError(f"segment {segment!r}; needed geometric or none")
     cloud = _read(path, options)
+    if options.masks is not None:
+        cloud = lay_masks(cloud, path, options.masks, min_score)
     if segment is not None:
         cloud = _segmented(path, cloud, unit)
     return _scan(path, cloud, unit, min_points)

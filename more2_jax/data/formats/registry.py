@@ -10,6 +10,9 @@ from pathlib import Path
 from typing import Protocol
 
 from more2_jax.data.formats import (
+    arkitscenes,
+    e57,
+    las,
     npz_scan,
     pcd,
     ply_folder,
@@ -37,6 +40,7 @@ class Format(Protocol):
 
 FORMATS: tuple[Format, ...] = (
     threerscan,
+    arkitscenes,
     scannet,
     scannetpp,
     replica,
@@ -44,6 +48,8 @@ FORMATS: tuple[Format, ...] = (
     ply_scan,
     npz_scan,
     pcd,
+    las,
+    e57,
     ply_folder,
 )
 WITH_DEPTH_FRAMES: tuple[Format, ...] = (threerscan,)
