@@ -134,7 +134,7 @@ def test_refusals():
     with pytest.raises(ValueError, match="needed more room"):
         flying_scene(meshes, FlyingConfig(room_m=(0.5, 0.5)), rng)
     with pytest.raises(ValueError, match="fewer than 1000000 points"):
-        flying_scene(meshes, FlyingConfig(scans=1, fewest_points=1_000_000, regime="paper"), rng)
+        flying_scene(meshes, FlyingConfig(scans=1, fewest_points=1_000_000, sensor=SENSOR), rng)
     with pytest.raises(ValueError, match=r"no free spot of radius 1\.00"):
         free_spot(rng, 1.0, [(0.0, 0.0, 3.0)], (4.0, 4.0))
 

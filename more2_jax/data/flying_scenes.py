@@ -5,36 +5,33 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float
-from scipy.spatial.transform import Rotation
+import trimesh
+from jaxtyping import Bool, Float
 
-from more2_jax.data.flying_shape import (
-    PlacedMesh,
-    Pose,
-    SensorConfig,
-    footprint_radius,
-    free_spot,
-    hemisphere_scan,
-    scan_room,
-    upright_pose,
-)
+from more2_jax.data.arrangement import arrange, circle
+from more2_jax.data.flying_cameras import CLEAN, SPARSE, hemisphere_cameras, inside_cameras
+from more2_jax.data.flying_shape import Camera, PlacedMesh, Pose, RoomCaster, SensorConfig, camera_matrix
 from more2_jax.data.meshes import SourceMesh, standing
 from more2_jax.types import Instance, Scan
 
-TRIES = 500
+__all__ = ["FlyingConfig", "FlyingScene", "TrueObject", "arrange", "flying_scene", "surface_samples"]
+
+Role = Literal["static", "moved", "removed", "added", "returning"]
+ARRANGEMENTS, CAMERA_SETS = 12, 6  # tried before a visit is given up
+SAMPLES = 1024  # of an object's surface, on which visibility is measured
 
 
 @dataclass(frozen=True)
 class FlyingConfig:
     """A furnished room and its visits. `paper` is METHOD 7; `sparse` adds what real scans have.
 
-    `paper`: every object alone, three clean depth images from the upper hemisphere.
-    `sparse`: cameras in the room, occlusion between objects, noise, dropout, a floor.
+    `paper`: three clean depth images of the room from the upper hemisphere.
+    `sparse`: cameras on one side of the room at a person's height, occlusion, noise, dropout, a floor.
     """
 
     scans: int = 3
@@ -45,7 +42,8 @@ class FlyingConfig:
     added: int = 0  # objects absent before some visit
     free: bool = False  # any orientation instead of upright
     fewest_points: int = 256  # an object seen less than this makes the visit be arranged anew
-    sensor: SensorConfig = field(default_factory=SensorConfig)
+    sensor: SensorConfig = field(default_factory=lambda: SPARSE)  # of `sparse`; `paper` has its own
+    returning: int = 0  # objects absent at some visits in the middle
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,6 +57,20 @@ class TrueObject:
     faces: np.ndarray
     instance: dict[int, int]
     T_scan_model: dict[int, Pose]
+    role: Role = "moved"
+    seen: dict[int, Bool[np.ndarray, " samples"]] = field(default_factory=dict)  # of `surface_samples`
+    symmetry_order: int | None = None  # about the vertical, see `yaw_symmetry`; None: not measured
+    licence: str = "unknown"
+    source: str = ""
+
+    def visible(self, scan: int) -> float:
+        """Share of the surface that the scan sees."""
+        return float(self.seen[scan].mean())
+
+    def overlap(self, a: int, b: int) -> float:
+        """Share of the surface seen by either of two scans that both see; 0 if neither sees any."""
+        both, either = (self.seen[a] & self.seen[b]).sum(), (self.seen[a] | self.seen[b]).sum()
+        return float(both / max(1, either))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,6 +79,11 @@ class FlyingScene:
 
     scans: tuple[Scan, ...]
     objects: tuple[TrueObject, ...]
+    T_scan_camera: tuple[
+        Float[np.ndarray, "cameras 4 4"], ...
+    ] = ()  # a scan; camera: x right, y down, z forward
+    name: str = "room"
+    regime: str = "sparse"
 
 
 def flying_scene(
@@ -74,80 +91,171 @@ def flying_scene(
 ) -> FlyingScene:
     """Furnishes a room with `models` (metres, z up; one twice for two identical objects) and scans it.
 
-    Raises ValueError if there are fewer models than roles, or no room for them.
+    Raises ValueError if there are fewer models than roles, too few scans for them, or no room.
     """
-    roles = config.static + config.removed + config.added
+    _check(models, config)
+    room = Furnished.of(models, config, rng)
+    visits: list[Visit] = []
+    for index in range(config.scans):
+        before = visits[-1].poses if visits else {}
+        visits.append(_visit(room, index, before, config, rng, f"{name}_{index}"))
+    objects = []
+    for n, m in zip(room.vertices, models, strict=True):
+        with_it = {k: v for k, v in enumerate(visits) if n in v.poses}
+        objects.append(
+            TrueObject(
+                name=n,
+                model=m.name,
+                category=m.category,
+                vertices=room.vertices[n],
+                faces=m.faces,
+                instance={k: v.ids[n] for k, v in with_it.items()},
+                T_scan_model={k: v.poses[n] for k, v in with_it.items()},
+                role=room.roles[n],
+                seen={k: v.seen[n] for k, v in with_it.items()},
+                licence=m.licence,
+                source=m.source,
+            )
+        )
+    return FlyingScene(
+        scans=tuple(v.scan for v in visits),
+        objects=tuple(objects),
+        T_scan_camera=tuple(np.stack([camera_matrix(c) for c in v.cameras]) for v in visits),
+        name=name,
+        regime=config.regime,
+    )
+
+
+def _check(models: Sequence[SourceMesh], config: FlyingConfig) -> None:
+    roles = config.static + config.removed + config.added + config.returning
     if not models or roles > len(models) or config.scans < 1:
         raise ValueError(
-            f"{len(models)} models for {roles} static, removed or added objects in {config.scans} scans;"
-            " needed at least one model, one a role, and a scan"
+            f"{len(models)} models for {roles} static, removed, added or returning objects in {config.scans}"
+            " scans; needed at least one model, one a role, and a scan"
         )
-    vertices = {f"object_{k}": standing(m.vertices) for k, m in enumerate(models)}
-    static, spans = _roles(list(vertices), config, rng)
-    scans, poses, seen = [], {}, {n: ({}, {}) for n in vertices}
-    for index in range(config.scans):
-        present = {n: v for n, v in vertices.items() if index in spans[n]}
-        poses, scan, ids = _visit(present, poses, models, static, config, rng, f"{name}_{index}")
-        scans.append(scan)
-        for n in present:
-            seen[n][0][index], seen[n][1][index] = ids[n], poses[n]
-    objects = [
-        TrueObject(
-            name=n,
-            model=m.name,
-            category=m.category,
-            vertices=vertices[n],
-            faces=m.faces,
-            instance=seen[n][0],
-            T_scan_model=seen[n][1],
-        )
-        for n, m in zip(vertices, models, strict=True)
-    ]
-    return FlyingScene(scans=tuple(scans), objects=tuple(objects))
+    if config.returning and config.scans < 3:
+        raise ValueError(f"{config.scans} scans for an object that goes and returns; needed 3")
 
 
-def _roles(
-    names: list[str], config: FlyingConfig, rng: np.random.Generator
-) -> tuple[frozenset[str], dict[str, range]]:
-    """Who is static, and at which visits each object is present."""
+def surface_samples(vertices: Float[np.ndarray, "v 3"], faces: np.ndarray) -> Float[np.ndarray, "samples 3"]:
+    """Points spread evenly over a model's surface, always the same: `TrueObject.seen` speaks of these."""
+    mesh = trimesh.Trimesh(vertices, faces, process=False)
+    return np.asarray(trimesh.sample.sample_surface(mesh, SAMPLES, seed=0)[0])
+
+
+@dataclass(frozen=True, kw_only=True)
+class Furnished:
+    """What is in a room over all visits; keys are the objects' names."""
+
+    models: dict[str, SourceMesh]
+    vertices: dict[str, np.ndarray]
+    samples: dict[str, np.ndarray]
+    roles: dict[str, Role]
+    present: dict[str, frozenset[int]]  # the scans that have it
+
+    @classmethod
+    def of(cls, models: Sequence[SourceMesh], config: FlyingConfig, rng: np.random.Generator) -> Furnished:
+        """Gives every model a name and a role."""
+        named = {f"object_{k}": m for k, m in enumerate(models)}
+        vertices = {n: standing(m.vertices) for n, m in named.items()}
+        roles = _roles(list(named), config, rng)
+        return cls(
+            models=named,
+            vertices=vertices,
+            samples={n: surface_samples(vertices[n], m.faces) for n, m in named.items()},
+            roles=roles,
+            present={n: _present(roles[n], config.scans, rng) for n in named},
+        )
+
+
+def _roles(names: list[str], config: FlyingConfig, rng: np.random.Generator) -> dict[str, Role]:
     order = [names[k] for k in rng.permutation(len(names))]
-    static, rest = order[: config.static], order[config.static :]
-    spans = {n: range(config.scans) for n in names}
-    for k, n in enumerate(rest[: config.removed + config.added]):
-        change = int(rng.integers(1, config.scans)) if config.scans > 1 else 1
-        spans[n] = range(change) if k < config.removed else range(change, config.scans)
-    return frozenset(static), spans
+    counts: dict[Role, int] = {
+        "static": config.static,
+        "removed": config.removed,
+        "added": config.added,
+        "returning": config.returning,
+    }
+    given: list[Role] = [role for role, count in counts.items() for _ in range(count)]
+    roles = dict(zip(order, [*given, *["moved"] * (len(order) - len(given))], strict=True))
+    return {n: roles[n] for n in names}  # pyright: ignore[reportReturnType]
+
+
+def _present(role: Role, scans: int, rng: np.random.Generator) -> frozenset[int]:
+    """The scans that have an object."""
+    everywhere = frozenset(range(scans))
+    if role == "returning":
+        gone = int(rng.integers(1, scans - 1))
+        return everywhere - frozenset(range(gone, int(rng.integers(gone + 1, scans))))
+    if role not in ("removed", "added"):
+        return everywhere
+    change = int(rng.integers(1, scans)) if scans > 1 else 1
+    return frozenset(range(change) if role == "removed" else range(change, scans))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Visit:
+    """One visit to the room: its scan, and where everything stood."""
+
+    scan: Scan
+    poses: dict[str, Pose]
+    ids: dict[str, int]
+    seen: dict[str, np.ndarray]
+    cameras: list[Camera]
 
 
 def _visit(
-    present: Mapping[str, np.ndarray],
+    room: Furnished,
+    index: int,
     before: Mapping[str, Pose],
-    models: Sequence[SourceMesh],
-    static: Collection[str],
     config: FlyingConfig,
     rng: np.random.Generator,
     name: str,
-) -> tuple[dict[str, Pose], Scan, dict[str, int]]:
+) -> Visit:
     """Arranges and scans until every object is seen well enough."""
-    number = {n: int(n.removeprefix("object_")) for n in present}
-    for _ in range(10):
+    present = {n: v for n, v in room.vertices.items() if index in room.present[n]}
+    static = [n for n in present if room.roles[n] == "static"]
+    sensor = CLEAN if config.regime == "paper" else config.sensor
+    for _ in range(ARRANGEMENTS):
         poses = arrange(present, before, static, config.room_m, rng, free=config.free)
-        placed = [
-            PlacedMesh(
-                model=models[number[n]].name, vertices=v, faces=models[number[n]].faces, T_room_model=poses[n]
-            )
-            for n, v in present.items()
-        ]
-        if config.regime == "paper":
-            points, owner = hemisphere_scan(placed, rng)
-        else:
-            points, owner = scan_room(placed, config.room_m, config.sensor, rng)
-        if all((owner == k).sum() >= config.fewest_points for k in range(len(placed))):
-            ids = rng.permutation(len(placed)) + 1  # ids say nothing from scan to scan
-            labels = [models[number[n]].category for n in present]
-            scan = _labelled_scan(name, points, owner, ids, labels)
-            return poses, scan, {n: int(i) for n, i in zip(present, ids, strict=True)}
+        placed = [_placed(room.models[n], v, poses[n]) for n, v in present.items()]
+        caster = RoomCaster(placed, None if config.regime == "paper" else config.room_m)
+        for _ in range(CAMERA_SETS):
+            cameras = _cameras(placed, config, sensor, rng)
+            points, owner = caster.scan(cameras, sensor, rng)
+            if (np.bincount(owner[owner >= 0], minlength=len(placed)) >= config.fewest_points).all():
+                ids = rng.permutation(len(placed)) + 1  # ids say nothing from scan to scan
+                labels = [room.models[n].category for n in present]
+                samples = {
+                    n: room.samples[n] @ p[:3, :3].T + p[:3, 3] for n, p in poses.items() if n in present
+                }
+                return Visit(
+                    scan=_labelled_scan(name, points, owner, ids, labels),
+                    poses=poses,
+                    ids={n: int(i) for n, i in zip(present, ids, strict=True)},
+                    seen={n: caster.sees(cameras, sensor, s) for n, s in samples.items()},
+                    cameras=cameras,
+                )
     raise ValueError(f"{name}: some object has fewer than {config.fewest_points} points however it stands")
+
+
+def _placed(model: SourceMesh, vertices: np.ndarray, pose: Pose) -> PlacedMesh:
+    return PlacedMesh(model=model.name, vertices=vertices, faces=model.faces, T_room_model=pose)
+
+
+def _cameras(
+    placed: Sequence[PlacedMesh], config: FlyingConfig, sensor: SensorConfig, rng: np.random.Generator
+) -> list[Camera]:
+    """Cameras as the regime has them."""
+    if config.regime == "paper":
+        corners = np.concatenate(
+            [p.vertices @ p.T_room_model[:3, :3].T + p.T_room_model[:3, 3] for p in placed]
+        )
+        return hemisphere_cameras(
+            float(np.ceil(10 * np.linalg.norm(corners, axis=1).max()) / 10), sensor, rng
+        )
+    taken = [circle(p.vertices, p.T_room_model, config.free) for p in placed]
+    return inside_cameras(config.room_m, taken, sensor, rng)
 
 
 def _labelled_scan(
@@ -163,52 +271,3 @@ def _labelled_scan(
         instances=tuple(sorted(instances, key=lambda instance: instance.id)),
         background=points[owner < 0],
     )
-
-
-def arrange(
-    present: Mapping[str, Float[np.ndarray, "v 3"]],
-    before: Mapping[str, Pose],
-    static: Collection[str],
-    room_m: tuple[float, float],
-    rng: np.random.Generator,
-    *,
-    free: bool = False,
-    moved_m: tuple[float, float] = (0.3, np.inf),
-) -> dict[str, Pose]:
-    """A pose in the room for the vertices of every object present, none touching another.
-
-    Static objects stay where they were `before`; the others come to stand `moved_m` (least, most) from there.
-    Raises ValueError when the room is too full.
-    """
-    for _ in range(TRIES):
-        poses = {n: before[n] for n in present if n in static and n in before}
-        taken = [(p[0, 3], p[1, 3], _reach(present[n], free)) for n, p in poses.items()]
-        try:
-            for n in (n for n in present if n not in poses):
-                spot = free_spot(rng, radius := _reach(present[n], free), taken, room_m)
-                taken.append((*spot, radius))
-                poses[n] = _pose(present[n], spot, rng, free)
-        except ValueError:
-            continue
-        moved = [n for n in present if n in before and n not in static]
-        if all(moved_m[0] < np.linalg.norm(poses[n][:2, 3] - before[n][:2, 3]) < moved_m[1] for n in moved):
-            return poses
-    raise ValueError(
-        f"no arrangement of {len(present)} objects in {room_m[0]} × {room_m[1]} m; needed more room"
-    )
-
-
-def _reach(vertices: Float[np.ndarray, "v 3"], free: bool) -> float:
-    """Radius about the model's origin that holds the footprint, however it is turned."""
-    return float(np.linalg.norm(vertices, axis=1).max()) if free else footprint_radius(vertices)
-
-
-def _pose(
-    vertices: Float[np.ndarray, "v 3"], spot: tuple[float, float], rng: np.random.Generator, free: bool
-) -> Pose:
-    if not free:
-        return upright_pose(rng.uniform(0, 2 * np.pi), *spot)
-    pose = np.eye(4)
-    pose[:3, :3] = Rotation.from_quat(rng.normal(size=4)).as_matrix()
-    pose[:3, 3] = *spot, -(vertices @ pose[2, :3]).min()  # touching the floor
-    return pose

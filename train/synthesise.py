@@ -1,0 +1,247 @@
+"""Meshes to scenes of the open FlyingShape benchmark (METHOD 7).
+
+`python -m train.synthesise --source MESHES --regime paper --scenes 100 --seed 0 --out data/flying_paper`
+
+Scene number i depends on the meshes, the seed and i alone. Finished scenes are kept: a stopped run resumes.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import os
+import sys
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import lru_cache, partial
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from rich.progress import track
+
+from more2_jax.data.benchmark import write_scene
+from more2_jax.data.closed_models import cache_name, make_cached, read_cached, read_models
+from more2_jax.data.flying_scenes import FlyingScene, flying_scene
+from more2_jax.data.furnishing import REGIMES, Regime, furniture, scene_config
+from more2_jax.data.meshes import SourceMesh
+from train.program import run
+
+ATTEMPTS = 5  # at furnishing a scene, before the room is called impossible
+
+
+def main(
+    source: Path,
+    regime: str,
+    out: Path,
+    scenes: int = 100,
+    seed: int = 0,
+    free: bool = False,
+    scans: int = 5,
+    up: Literal["y", "z"] = "z",
+    longest_m: float | None = None,
+    licence: str | None = None,
+    attribution: str | None = None,
+    room_m: tuple[float, float] = (7.0, 6.0),
+    cache: Path | None = None,
+    workers: int = 0,
+) -> None:
+    """Writes scenes with ground truth, index.json, LICENSES.md and report.json (models left out, and why).
+
+    Args:
+        source: folder of meshes, packed .npz, or whatever else train.prepare reads.
+        regime: paper, sparse, identical or changes.
+        out: folder of the scenes.
+        scenes: how many.
+        seed: of everything.
+        free: any orientation, not only upright.
+        scans: visits a scene.
+        up: the source's vertical axis (heldout_ikea.npz is known).
+        longest_m: scales every mesh to this longest edge; without it the source is in metres.
+        licence: of meshes that come without one.
+        attribution: who is to be named, for LICENSES.md.
+        room_m: floor, x by y.
+        cache: folder of closed models, to share between benchmarks; inside `out` otherwise.
+        workers: processes; 0 for one a core.
+    """
+    scene_config(_regime(regime), scans, np.random.default_rng(0), free=free)
+    if scenes < 1 or seed < 0 or min(room_m) <= 0:
+        raise ValueError(f"{scenes} scenes, seed {seed}, room {room_m}; needed positive numbers, seed from 0")
+    unreadable: dict[str, str] = {}
+    meshes = read_models(source, up=up, longest_m=longest_m, licence=licence, unreadable=unreadable)
+    job = Job(
+        meshes=tuple(meshes),
+        cache=cache or out / "models",
+        out=out,
+        regime=_regime(regime),
+        free=free,
+        scans=scans,
+        seed=seed,
+        room_m=room_m,
+    )
+    claim(job)
+    with processes(job, workers) as pool:
+        rejected = check_models(job, pool)
+        _write(out / "report.json", {"rejected": rejected, "unreadable": unreadable})
+        usable = len(meshes) - len(rejected)
+        digests = make_scenes(job, scenes, pool)
+    _write(out / "index.json", {**job.facts, "scenes": digests})
+    write_licences(out, attribution)
+    print(f"{scenes} scenes of {scans} scans from {usable} models, {len(rejected)} rejected, in {out}")
+
+
+def _regime(name: str) -> Regime:
+    """Raises ValueError if there is no such regime."""
+    for regime in REGIMES:
+        if regime == name:
+            return regime
+    raise ValueError(f"regime {name!r}; needed one of {', '.join(REGIMES)}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Job:
+    """Everything that scenes depend on, but their number."""
+
+    meshes: tuple[SourceMesh, ...]
+    cache: Path
+    out: Path
+    regime: Regime
+    free: bool
+    scans: int
+    seed: int
+    room_m: tuple[float, float]
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """Settings for scene.json and index.json; `models` is a digest of the meshes."""
+        models = hashlib.sha1("\n".join(f"{m.name} {cache_name(m)}" for m in self.meshes).encode())
+        return {
+            "version": 1,
+            "regime": self.regime,
+            "free": self.free,
+            "seed": self.seed,
+            "scans_a_scene": self.scans,
+            "room_m": list(self.room_m),
+            "models": models.hexdigest(),
+        }
+
+
+def claim(job: Job) -> None:
+    """Makes the folder. Raises ValueError if it holds scenes of other settings."""
+    settings = job.out / "settings.json"
+    job.cache.mkdir(parents=True, exist_ok=True)
+    job.out.mkdir(parents=True, exist_ok=True)
+    if settings.exists() and json.loads(settings.read_text()) != job.facts:
+        raise ValueError(f"{job.out}: scenes of other models or settings; needed the same, or another folder")
+    _write(settings, job.facts)
+
+
+_job: Job | None = None  # of this worker process
+
+
+def _start(job: Job) -> None:
+    global _job
+    _job = job
+
+
+@contextmanager
+def processes(job: Job, workers: int) -> Iterator[ProcessPoolExecutor]:
+    """Worker processes that know the job; spawned, since a fork after threads have started may hang."""
+    pool = ProcessPoolExecutor(
+        workers or os.cpu_count(), mp_context=get_context("spawn"), initializer=_start, initargs=(job,)
+    )
+    try:
+        yield pool
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def check_models(job: Job, pool: ProcessPoolExecutor) -> dict[str, str]:
+    """Closes every model once; the names of those that cannot be used, with the reason."""
+    reasons = pool.map(partial(make_cached, cache=job.cache), job.meshes)
+    shown = track(reasons, "models", total=len(job.meshes), disable=not sys.stdout.isatty())
+    return {m.name: reason for m, reason in zip(job.meshes, shown, strict=True) if reason is not None}
+
+
+def make_scenes(job: Job, count: int, pool: ProcessPoolExecutor) -> dict[str, str]:
+    """Writes the scenes that are not there yet; name → digest of all."""
+    names = [f"scene_{k:04d}" for k in range(count)]
+    digests = pool.map(make_scene, range(count))
+    shown = track(digests, "scenes", total=count, disable=not sys.stdout.isatty())
+    return dict(zip(names, shown, strict=True))
+
+
+def make_scene(number: int) -> str:
+    """Makes and writes one scene of this process's job; returns its digest. A finished one is left alone."""
+    if _job is None:
+        raise RuntimeError("make_scene outside a worker process")
+    job = _job
+    name = f"scene_{number:04d}"
+    done = job.out / name / "scene.json"
+    if done.exists():
+        return json.loads(done.read_text())["digest"]
+    models, symmetry = usable_models(job)
+    rng = np.random.default_rng((job.seed, number))
+    scene = _furnished(job, models, rng, name)
+    # A rescaled copy has the symmetry of what it is a copy of only up to half a turn: it is left unmeasured.
+    objects = tuple(dataclasses.replace(o, symmetry_order=symmetry.get(o.model)) for o in scene.objects)
+    scene = dataclasses.replace(scene, objects=objects, regime=job.regime)
+    return write_scene(job.out / name, scene, {**job.facts, "number": number}, rng)
+
+
+def _furnished(job: Job, models: list[SourceMesh], rng: np.random.Generator, name: str) -> FlyingScene:
+    """A scene; other furniture where the first does not fit. ValueError if none fits."""
+    last = ValueError("no furniture fits")
+    for _ in range(ATTEMPTS):
+        config = scene_config(job.regime, job.scans, rng, free=job.free)
+        chosen = furniture(job.regime, models, rng)
+        try:
+            return flying_scene(chosen, dataclasses.replace(config, room_m=job.room_m), rng, name)
+        except ValueError as error:
+            last = error
+    raise last
+
+
+@lru_cache(maxsize=1)
+def _usable(job_id: int) -> tuple[list[SourceMesh], dict[str, int]]:
+    assert _job is not None
+    return read_cached(_job.meshes, _job.cache)
+
+
+def usable_models(job: Job) -> tuple[list[SourceMesh], dict[str, int]]:
+    """The closed models, read once a process, and their symmetry."""
+    return _usable(id(job))
+
+
+def write_licences(out: Path, attribution: str | None) -> None:
+    """LICENSES.md: the models that the scenes show, by source and licence."""
+    used: dict[tuple[str, str], set[str]] = {}
+    for path in sorted(out.glob("scene_*/scene.json")):
+        for o in json.loads(path.read_text())["objects"]:
+            used.setdefault((o["source"], o["licence"]), set()).add(o["model"].split("~")[0])
+    lines = ["# Models in these scenes", ""]
+    lines += [f"Attribution: {attribution}", ""] if attribution else []
+    for (source, licence), models in sorted(used.items()):
+        lines += [
+            f"## {source}",
+            "",
+            f"Licence: {licence}. Closed, and scaled to metres where it came without",
+        ]
+        lines += ["a unit; in regime `identical` also slightly rescaled.", ""]
+        lines += [f"- {m}" for m in sorted(models)] + [""]
+    (out / "LICENSES.md").write_text("\n".join(lines), encoding="utf-8")
+
+
+def _write(path: Path, content: Sequence[Any] | dict[str, Any]) -> None:
+    """Atomically."""
+    partial_file = path.with_suffix(".partial")
+    partial_file.write_text(json.dumps(content, indent=1), encoding="utf-8")
+    partial_file.replace(path)
+
+
+if __name__ == "__main__":
+    run(main)
