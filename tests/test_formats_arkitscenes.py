@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from more2_jax.data.scans import read_scan
-from tests.dataset_writers.arkitscenes import box, write_arkitscenes
+from dataset_writers.arkitscenes import box, write_arkitscenes
 
 RNG = np.random.default_rng(0)
 POINTS = RNG.uniform(-2, 2, (4000, 3)).astype(np.float32).astype(np.float64)

@@ -7,7 +7,7 @@ import pytest
 
 pytest.importorskip("laspy")
 from more2_jax.data.scans import read_scan
-from tests.dataset_writers.las import write_las
+from dataset_writers.las import write_las
 
 RNG = np.random.default_rng(0)
 POINTS = RNG.uniform(-2, 2, (500, 3))

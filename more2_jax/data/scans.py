@@ -51,8 +51,7 @@ def read_scan(
     """
     path = Path(path)
     if unit not in UNITS_M or segment not in (None, "geometric"):
-        units = ", ".join(UNITS_M)
-        raise ValueError(f"unit {unit!r}, segment {segment!r}; needed one of {units}; geometric or None")
+        raise ValueError(f"unit {unit!r}, segment {segment!r}; needed m, cm or mm; geometric or None")
     if not path.exists():
         raise ValueError(f"{path}: no such file or folder")
     options = ReadOptions(
@@ -62,8 +61,8 @@ def read_scan(
         depth_frames=depth_frames,
     )
     cloud = _read(path, options)
-    if options.masks is not None:
-        cloud = lay_masks(cloud, path, options.masks, min_score)
+    if masks is not None:
+        cloud = lay_masks(cloud, path, Path(masks), min_score)
     if segment is not None:
         cloud = _segmented(path, cloud, unit)
     return _scan(path, cloud, unit, min_points)

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tests.dataset_writers.ply_file import vertex_columns, write_ply
+from dataset_writers.ply_file import vertex_columns, write_ply
 
 
 def box(label: str, center, lengths, axes=None) -> dict:
