@@ -89,7 +89,7 @@ def test_shards_resume_and_repeat(folder: Path, tmp_path: Path, monkeypatch: pyt
 
 
 def procedural_meshes_name() -> str:
-    return next(iter(prepare.procedural_meshes(1))).name
+    return next(iter(prepare.procedural_recipes(1))).name
 
 
 @pytest.mark.slow

@@ -17,7 +17,7 @@ from rich.progress import track
 from more2_jax.data.fan_out import Workers
 from more2_jax.data.heldout import read_ikea
 from more2_jax.data.meshes import SourceMesh, read_meshes
-from more2_jax.data.procedural import procedural_meshes
+from more2_jax.data.procedural import Recipe, procedural_recipes
 from more2_jax.data.shapes import Shape, make_shape
 from more2_jax.data.shards import write_shard
 from train.program import run
@@ -49,7 +49,7 @@ def main(
         ray: address of a Ray cluster to spread the work over instead ("local" starts one here).
     """
     unreadable: dict[str, str] = {}
-    meshes = list(procedural_meshes(procedural))
+    meshes: list[SourceMesh | Recipe] = [*procedural_recipes(procedural)]
     for path in source:
         meshes += _read(path, most_per_source, unreadable)
     for path in held_out:
@@ -66,7 +66,9 @@ def main(
     )
 
 
-def make_shards(out: Path, meshes: list[SourceMesh], report: Report, workers: int, ray: str | None) -> None:
+def make_shards(
+    out: Path, meshes: list[SourceMesh | Recipe], report: Report, workers: int, ray: str | None
+) -> None:
     """Writes the shards that are not there yet."""
     starts = range(0, len(meshes), SHARD)
     with Workers(workers, ray) as pool:
@@ -96,10 +98,10 @@ class Rejected:
     reason: str
 
 
-def prepare(mesh: SourceMesh) -> Shape | Rejected:
+def prepare(mesh: SourceMesh | Recipe) -> Shape | Rejected:
     """One shape, or the reason why the mesh cannot be used."""
     try:
-        return make_shape(mesh)
+        return make_shape(mesh.mesh() if isinstance(mesh, Recipe) else mesh)
     except ValueError as error:
         return Rejected(name=mesh.name, reason=str(error))
 
@@ -114,7 +116,7 @@ class Report:
     unreadable: dict[str, str]  # name → reason, of files that did not become a mesh
 
     @classmethod
-    def open(cls, path: Path, meshes: list[SourceMesh], unreadable: dict[str, str]) -> Report:
+    def open(cls, path: Path, meshes: list[SourceMesh | Recipe], unreadable: dict[str, str]) -> Report:
         """The report so far. Raises ValueError if the folder's shards are of other meshes."""
         digest = hashlib.sha1("\n".join(m.name for m in meshes).encode()).hexdigest()
         found = json.loads(path.read_text()) if path.exists() else {"digest": digest, "rejected": {}}

@@ -1,5 +1,11 @@
 """Parametric furniture."""
 
-from more2_jax.data.procedural.furniture import CATEGORIES, procedural_mesh, procedural_meshes
+from more2_jax.data.procedural.furniture import (
+    CATEGORIES,
+    Recipe,
+    procedural_mesh,
+    procedural_meshes,
+    procedural_recipes,
+)
 
-__all__ = ["CATEGORIES", "procedural_mesh", "procedural_meshes"]
+__all__ = ["CATEGORIES", "Recipe", "procedural_mesh", "procedural_meshes", "procedural_recipes"]

@@ -7,6 +7,7 @@ that reach into each other.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -42,7 +43,30 @@ CATEGORIES: dict[str, Callable[[Rng], list[Manifold]]] = {
 }
 
 
-def procedural_meshes(count: int, first: int = 0) -> Iterator[SourceMesh]:
+@dataclass(frozen=True)
+class Recipe:
+    """A piece that is not made yet: what workers are sent instead of meshes."""
+
+    category: str
+    seed: int
+    source: str = "procedural"
+
+    @property
+    def name(self) -> str:
+        """The name of the mesh."""
+        return f"procedural_{self.category.replace(' ', '_')}_{self.seed:04d}"
+
+    @property
+    def digest(self) -> int:
+        """The mesh's digest."""
+        return name_digest(self.name)
+
+    def mesh(self) -> SourceMesh:
+        """Makes the piece."""
+        return procedural_mesh(self.category, self.seed)
+
+
+def procedural_recipes(count: int, first: int = 0) -> list[Recipe]:
     """`count` pieces, the categories in turn, beginning with the piece of number `first`.
 
     Piece k is seed k // 14 of category k % 14, so that ranges can be made apart. Raises ValueError if either
@@ -51,8 +75,15 @@ def procedural_meshes(count: int, first: int = 0) -> Iterator[SourceMesh]:
     if count < 0 or first < 0:
         raise ValueError(f"{count} procedural meshes from number {first}; needed 0 or more of both")
     categories = list(CATEGORIES)
-    for index in range(first, first + count):
-        yield procedural_mesh(categories[index % len(categories)], index // len(categories))
+    return [
+        Recipe(categories[k % len(categories)], k // len(categories)) for k in range(first, first + count)
+    ]
+
+
+def procedural_meshes(count: int, first: int = 0) -> Iterator[SourceMesh]:
+    """The pieces of `procedural_recipes`, made one after the other."""
+    recipes = procedural_recipes(count, first)
+    return (recipe.mesh() for recipe in recipes)
 
 
 def procedural_mesh(category: str, seed: int) -> SourceMesh:
@@ -64,11 +95,12 @@ def procedural_mesh(category: str, seed: int) -> SourceMesh:
     rng = np.random.default_rng([name_digest(category) % 2**64, seed])
     mesh = _filled(union(CATEGORIES[category](rng))).to_mesh64()
     return SourceMesh(
-        name=f"procedural_{category.replace(' ', '_')}_{seed:04d}",
+        name=Recipe(category, seed).name,
         category=category,
         vertices=standing(np.array(mesh.vert_properties[:, :3], np.float64)),
         faces=np.array(mesh.tri_verts, np.int64),
         source="procedural",
+        licence="MIT; this project's own",
     )
 
 
