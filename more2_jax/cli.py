@@ -4,19 +4,19 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
 from tyro.conf import OmitArgPrefixes, OmitSubcommandPrefixes, Positional, arg, subcommand
 
-from more2_jax.commands import priors, scenes
+from more2_jax.commands import building, priors, scenes
+from more2_jax.commands.options import Reading, Reporting
 from more2_jax.commands.session import one_line
 from more2_jax.commands.settings import scene_config
 
 PresetName = Literal["robust", "paper"]
-Unit = Literal["m", "cm", "mm"]
 BAD_INPUT = (ValueError, FileNotFoundError, PermissionError, IsADirectoryError, NotADirectoryError)
 
 
@@ -28,16 +28,20 @@ class Demo:
     """
 
     out: Path = Path("demo_scene")
-    """Folder of the living scene; new, empty, or a living scene to replace."""
+    """Folder of the living scene, saved after every scan; new, empty, or a living scene to replace."""
     preset: PresetName = "robust"
     """robust: several starts a pair. paper: the method to the letter."""
     upright: bool = True
     """Objects turn about the vertical (z) only."""
     prior: str = "small"
     """Name of shipped weights, or a file."""
+    resume: bool = False
+    """Go on with the same command after an interruption: keep the scans already in the folder."""
+    reporting: Reporting = field(default_factory=Reporting)
 
     def __call__(self) -> int:
-        scenes.demo(self.out, scene_config(self.preset, self.upright, None), self.prior)
+        config = scene_config(self.preset, self.upright, None)
+        building.demo(self.out, config, self.prior, resume=self.resume, reporting=self.reporting)
         return 0
 
 
@@ -51,32 +55,33 @@ class Run:
     scans: Annotated[Positional[tuple[Path, ...]], arg(metavar="SCAN [SCAN ...]")]
     """PLY with an integer property naming the instance, NPZ, or a folder of one PLY per object."""
     out: Path
-    """Folder of the living scene; new, empty, or a living scene to replace."""
+    """Folder of the living scene, saved after every scan; new, empty, or a living scene to replace."""
     preset: PresetName = "robust"
     """robust: several starts a pair. paper: the method to the letter."""
     upright: bool = False
     """Objects turn about the vertical (z) only."""
     prior: str = "small"
     """Name of shipped weights, or a file."""
-    unit: Unit = "m"
-    """Unit of the scans' coordinates."""
-    instance_property: str | None = None
-    """Property of the points that names the instance, where it is none of the usual."""
-    segment: Literal["geometric"] | None = None
-    """geometric: cut a scan without masks into planes and clusters; masks from a network are better."""
+    masks: tuple[Path, ...] = ()
+    """Predicted masks (Mask3D) beside scans without their own: none, or one a scan in the same order."""
+    reading: Reading = field(default_factory=Reading)
     config: Path | None = None
     """YAML with values that replace the preset's."""
+    resume: bool = False
+    """Go on with the same command after an interruption: keep the scans already in the folder."""
+    reporting: Reporting = field(default_factory=Reporting)
 
     def __call__(self) -> int:
         config = scene_config(self.preset, self.upright, self.config)
-        scenes.run_scans(
+        building.run_scans(
             self.scans,
             self.out,
             config,
             self.prior,
-            unit=self.unit,
-            instance_property=self.instance_property,
-            segment=self.segment,
+            reading=self.reading,
+            masks=self.masks,
+            resume=self.resume,
+            reporting=self.reporting,
         )
         return 0
 
@@ -94,15 +99,20 @@ class Add:
     """The scan to add, later than all others."""
     prior: str | None = None
     """The weights the scene was made with, where they are not shipped."""
-    unit: Unit = "m"
-    """Unit of the scan's coordinates."""
-    instance_property: str | None = None
-    """Property of the points that names the instance, where it is none of the usual."""
-    segment: Literal["geometric"] | None = None
-    """geometric: cut a scan without masks into planes and clusters; masks from a network are better."""
+    masks: Path | None = None
+    """Predicted masks (Mask3D) beside a scan without its own."""
+    reading: Reading = field(default_factory=Reading)
+    reporting: Reporting = field(default_factory=Reporting)
 
     def __call__(self) -> int:
-        scenes.add(self.folder, self.scan, self.prior, self.unit, self.instance_property, self.segment)
+        building.add(
+            self.folder,
+            self.scan,
+            self.prior,
+            reading=self.reading,
+            masks=self.masks,
+            reporting=self.reporting,
+        )
         return 0
 
 
@@ -115,17 +125,14 @@ class Inspect:
 
     scan: Positional[Path]
     """PLY, NPZ, or a folder of one PLY per object."""
-    unit: Unit = "m"
-    """Unit of the scan's coordinates."""
-    instance_property: str | None = None
-    """Property of the points that names the instance, where it is none of the usual."""
-    segment: Literal["geometric"] | None = None
-    """geometric: cut a scan without masks into planes and clusters; masks from a network are better."""
+    masks: Path | None = None
+    """Predicted masks (Mask3D) beside a scan without its own."""
+    reading: Reading = field(default_factory=Reading)
     min_points: int = 64
     """Objects of fewer points are left out."""
 
     def __call__(self) -> int:
-        scenes.inspect(self.scan, self.unit, self.instance_property, self.min_points, self.segment)
+        scenes.inspect(self.scan, self.reading, self.masks, self.min_points)
         return 0
 
 
@@ -156,11 +163,12 @@ class Export:
     folder: Positional[Path]
     """The living scene."""
     format: Literal["glb", "usd", "ply", "json"]
-    """glb and ply show one scan; usd has them all as time samples; json is poses and changes."""
+    """glb: meshes, animated over the scans, y up. usd: the same as time samples. ply: points of one scan. json:
+    poses and changes."""
     out: Path | None = None
     """File or folder to write to; by default a file beside the living scene's folder."""
     scan: int = -1
-    """The scan shown by glb and ply, from 0; -1 is the last."""
+    """The scan shown by ply, and by glb at rest, from 0; -1 is the last."""
 
     def __call__(self) -> int:
         scenes.export(self.folder, self.format, self.out, self.scan)
@@ -273,8 +281,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     except OSError as error:
         print(f"error: {one_line(error)}", file=sys.stderr)
         return 1
-    except KeyboardInterrupt:
-        print("interrupted", file=sys.stderr)
+    except KeyboardInterrupt as error:
+        print(f"interrupted; {error}" if error.args else "interrupted", file=sys.stderr)
         return 130
 
 

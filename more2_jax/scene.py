@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+from functools import partial
 
 import numpy as np
 
@@ -15,15 +13,21 @@ from more2_jax.fitting import embed_accumulated, fit_objects
 from more2_jax.meshing import extract_mesh, observed_level
 from more2_jax.objects import changes_between, new_object, seen_again
 from more2_jax.prior import Prior
+from more2_jax.progress import Watcher, staged
 from more2_jax.tracking import match_scan, register_scan
 from more2_jax.types import Instance, LivingScene, Mesh, Scan, ScanRecord, SceneObject, Skipped
 
 
-def start_scene(prior: Prior, scan: Scan, config: SceneConfig) -> LivingScene:
-    """The living scene of one scan: every instance is an object, seen once. Raises ValueError if there is none."""
+def start_scene(
+    prior: Prior, scan: Scan, config: SceneConfig, *, progress: Watcher | None = None
+) -> LivingScene:
+    """The living scene of one scan: every instance is an object, seen once. Raises ValueError if there is none.
+
+    `progress` is told of every stage, here and below.
+    """
     instances, skipped = usable(scan, config)
     timing: dict[str, float] = {}
-    with timed(timing, "encode"):
+    with staged(timing, progress, "encode", len(instances), scan=scan.name):
         embeddings = embed(prior, [i.points for i in instances])
     objects = [new_object(k, 0, i, e) for k, (i, e) in enumerate(zip(instances, embeddings, strict=True))]
     return LivingScene(
@@ -37,7 +41,9 @@ def start_scene(prior: Prior, scan: Scan, config: SceneConfig) -> LivingScene:
     )
 
 
-def add_scan(prior: Prior, scene: LivingScene, scan: Scan, config: SceneConfig) -> LivingScene:
+def add_scan(
+    prior: Prior, scene: LivingScene, scan: Scan, config: SceneConfig, *, progress: Watcher | None = None
+) -> LivingScene:
     """Matches a new scan's instances to the scene's objects, registers every pair in one call, notes what changed.
 
     Objects that were absent for a while can come back. Meshes of objects seen again are dropped; `reconstruct`
@@ -45,16 +51,17 @@ def add_scan(prior: Prior, scene: LivingScene, scan: Scan, config: SceneConfig) 
     """
     instances, skipped = usable(scan, config)
     index, timing, objects = len(scene.scans), dict(scene.timing_s), list(scene.objects)
-    with timed(timing, "encode"):
+    stage = partial(staged, timing, progress, scan=scan.name)
+    with stage("encode", len(instances)):
         embeddings = embed(prior, [i.points for i in instances])
-    with timed(timing, "match"):
+    with stage("match", len(instances)):
         pairs = match_scan(objects, instances, embeddings, config)
-    with timed(timing, "register"):
+    with stage("register", len(pairs), unit="pairs"):
         found = register_scan(prior, objects, instances, embeddings, pairs, index, config)
     for k, i, observation in found:
         objects[k] = seen_again(objects[k], instances[i], observation)
     if config.accumulate_target:
-        with timed(timing, "encode"):
+        with stage("encode", len(found)):
             objects = embed_accumulated(prior, objects, [k for k, _, _ in found])
     known = {i for _, i, _ in found}
     for i in (i for i in range(len(instances)) if i not in known):
@@ -68,18 +75,22 @@ def add_scan(prior: Prior, scene: LivingScene, scan: Scan, config: SceneConfig) 
     )
 
 
-def reconstruct(prior: Prior, scene: LivingScene, config: SceneConfig) -> LivingScene:
+def reconstruct(
+    prior: Prior, scene: LivingScene, config: SceneConfig, *, progress: Watcher | None = None
+) -> LivingScene:
     """Optimises code and poses of every object seen more than once, all in one call, then extracts meshes.
 
     Objects that have a mesh have not changed since and are left alone.
     """
     timing, objects = dict(scene.timing_s), list(scene.objects)
     todo = [k for k, o in enumerate(objects) if o.mesh is None]
-    with timed(timing, "joint"):
-        objects = fit_objects(prior, objects, [k for k in todo if len(objects[k].observations) > 1], config)
-    with timed(timing, "mesh"):
-        for k in todo:
+    again = [k for k in todo if len(objects[k].observations) > 1]
+    with staged(timing, progress, "joint", len(again)):
+        objects = fit_objects(prior, objects, again, config)
+    with staged(timing, progress, "mesh", len(todo)) as advance:
+        for done, k in enumerate(todo, start=1):
             objects[k] = dataclasses.replace(objects[k], mesh=mesh_of(prior, objects[k], config))
+            advance(done)
     changes = tuple(changes_between(objects, c.from_scan, c.to_scan, config) for c in scene.changes)
     return dataclasses.replace(scene, objects=tuple(objects), changes=changes, timing_s=timing)
 
@@ -116,11 +127,3 @@ def record(index: int, scan: Scan, instances: list[Instance], skipped: tuple[Ski
     """What the scene remembers of a scan."""
     ids = tuple(i.id for i in instances)
     return ScanRecord(index=index, name=scan.name, source=scan.source, instances=ids, skipped=skipped)
-
-
-@contextmanager
-def timed(timing: dict[str, float], stage: str) -> Iterator[None]:
-    """Adds the seconds of a stage."""
-    began = time.perf_counter()
-    yield
-    timing[stage] = timing.get(stage, 0.0) + time.perf_counter() - began

@@ -14,7 +14,7 @@ LONGEST_FILE, LONGEST_FUNCTION = 400, 40  # lines
 
 # Low to high; a module imports from its own layer or those before it. `data.*` and `commands.*` are folders.
 LAYERS = {
-    "types": ("types", "config"),
+    "types": ("types", "config", "progress"),
     "tools": ("geometry", "batching", "descent", "metrics", "meshfile", "data"),
     "network": ("vn", "neighbours", "encoder", "decoder", "prior", "losses", "published", "checkpoint"),
     "stages": ("starts", "matching", "registration", "meshing", "joint"),

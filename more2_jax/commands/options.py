@@ -1,0 +1,33 @@
+"""Options that several commands share."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+Unit = Literal["m", "cm", "mm"]
+
+
+@dataclass(frozen=True)
+class Reading:
+    """What the caller knows of scans beyond their format."""
+
+    unit: Unit = "m"
+    """Unit of the scans' coordinates."""
+    instance_property: str | None = None
+    """Property of the points that names the instance, where it is none of the usual."""
+    segment: Literal["geometric"] | None = None
+    """geometric: cut a scan without masks into planes and clusters; masks from a network are better."""
+    depth_frames: bool = False
+    """Points from the raw depth of a 3RScan folder rather than from its mesh."""
+
+
+@dataclass(frozen=True)
+class Reporting:
+    """What is said while a command works."""
+
+    quiet: bool = False
+    """Print warnings and errors only."""
+    log_json: Path | None = None
+    """File for one JSON object a line and event: stages with counts and seconds, messages, errors."""

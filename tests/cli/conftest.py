@@ -1,0 +1,30 @@
+"""Weights, cache and a stored scene for tests of the command line."""
+
+from pathlib import Path
+
+import jax
+import pytest
+from command_line import TINY
+from factories import living_scene
+
+from more2_jax.config import preset
+from more2_jax.io import save_scene
+from more2_jax.prior import init_prior, save_prior
+
+
+@pytest.fixture(scope="session")
+def tiny(tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("weights") / "tiny.npz"
+    save_prior(init_prior(TINY, jax.random.key(0), "tiny"), path)
+    return path
+
+
+@pytest.fixture(autouse=True)
+def own_cache(monkeypatch, tmp_path_factory):
+    monkeypatch.setenv("MORE2_CACHE", str(tmp_path_factory.getbasetemp() / "cache"))
+
+
+@pytest.fixture
+def stored(tmp_path) -> Path:
+    save_scene(living_scene(), tmp_path / "room", preset("robust", upright=True))
+    return tmp_path / "room"
