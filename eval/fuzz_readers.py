@@ -1,8 +1,8 @@
 """Do the readers survive damaged files? `python -m eval.fuzz_readers --fixtures DIR --out runs/fuzz`
 
-The fixtures, small true files of every format, are written by `PYTHONPATH=tests python -m dataset_writers DIR`. Each mutation
-is read in a worker process. It may give a scan or a ValueError of one printable line, within the time and memory
-allowed; anything else is a finding, kept with its files and replayed by `--format F --replay NUMBER`.
+The fixtures, small true files of every format, are written by `PYTHONPATH=tests python -m dataset_writers DIR`.
+Each mutation is read in a worker process. It may give a scan or a ValueError of one printable line, within the
+time and memory allowed; anything else is a finding, kept with its files and replayed by `--format F --replay NUMBER`.
 """
 
 from __future__ import annotations

@@ -4,10 +4,10 @@ import json
 
 import numpy as np
 import pytest
+from dataset_writers.arkitscenes import box, write_arkitscenes
 from scipy.spatial.transform import Rotation
 
 from more2_jax.data.scans import read_scan
-from dataset_writers.arkitscenes import box, write_arkitscenes
 
 RNG = np.random.default_rng(0)
 POINTS = RNG.uniform(-2, 2, (4000, 3)).astype(np.float32).astype(np.float64)

@@ -7,10 +7,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 pytest.importorskip("pye57")
+from dataset_writers.e57 import write_e57
+
 from more2_jax.data.formats import e57
 from more2_jax.data.labelled import ReadOptions
 from more2_jax.data.scans import read_scan
-from dataset_writers.e57 import write_e57
 
 RNG = np.random.default_rng(0)
 POINTS = RNG.uniform(-2, 2, (300, 3)).astype(np.float32).astype(np.float64)  # pye57 writes single precision

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 pytest.importorskip("laspy")
-from more2_jax.data.scans import read_scan
 from dataset_writers.las import write_las
+
+from more2_jax.data.scans import read_scan
 
 RNG = np.random.default_rng(0)
 POINTS = RNG.uniform(-2, 2, (500, 3))

@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
-
-from more2_jax.data.scans import read_scan
 from dataset_writers.masks import write_masks
 from dataset_writers.ply_file import vertex_columns, write_ply
+
+from more2_jax.data.scans import read_scan
 
 RNG = np.random.default_rng(0)
 POINTS = RNG.uniform(-2, 2, (400, 3)).astype(np.float32).astype(np.float64)

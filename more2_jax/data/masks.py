@@ -8,7 +8,8 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 from jaxtyping import Bool, Float
 
-from more2_jax.data.labelled import UNREADABLE, LabelledCloud, instance_ids, one_line
+from more2_jax.data.labelled import LabelledCloud, instance_ids, one_line
+from more2_jax.data.npz_file import read_arrays
 from more2_jax.types import Skipped
 
 PER_POINT = ("objectId", "instance")  # arrays of an NPZ with one instance a point
@@ -92,15 +93,9 @@ def _check_count(file: Path, name: str, values: np.ndarray, cloud: LabelledCloud
 
 
 def _arrays(file: Path) -> dict[str, np.ndarray]:
-    try:
-        with np.load(file, allow_pickle=False) as content:
-            names = ("masks", "scores", "labels", *PER_POINT)
-            arrays = {k: content[k] for k in names if k in content.files}
-            has = ", ".join(content.files) or "nothing"
-    except (*UNREADABLE, MemoryError) as error:
-        raise ValueError(f"{file}: not a readable NPZ file ({one_line(error)})") from error
+    arrays, has = read_arrays(file, ("masks", "scores", "labels", *PER_POINT))
     if not {"masks", *PER_POINT} & set(arrays):
-        raise ValueError(one_line(ValueError(f"{file}: arrays are {has}; needed masks or objectId")))
+        raise ValueError(f"{file}: arrays are {has}; needed masks or objectId")
     return arrays
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from more2_jax.data.formats.registry import FORMATS, WITH_DEPTH_FRAMES
-from more2_jax.data.labelled import LabelledCloud, ReadOptions
+from more2_jax.data.labelled import LabelledCloud, ReadOptions, one_line
 from more2_jax.data.masks import lay_masks
 from more2_jax.data.segmentation import SegmentationConfig, segment_geometric
 from more2_jax.types import Instance, Scan, Skipped
@@ -21,6 +21,7 @@ MASKS_ARE_BETTER = (
     "instances are clusters, found without a network: objects that touch are one. Masks from a network are"
     " better: pass Mask3D's output with --masks, or name an instance property with --instance-property"
 )
+LARGEST_COORDINATE = 1e12  # in any unit; beyond, squares and sums lose all meaning
 CM_OR_MM = 380.0  # between 120 and 1200, a chair in either
 
 
@@ -94,7 +95,13 @@ def _read(path: Path, options: ReadOptions) -> LabelledCloud:
         if form.recognises(path):
             if options.depth_frames and form not in WITH_DEPTH_FRAMES:
                 raise ValueError(f"{path}: depth frames asked for; needed the folder of a 3RScan scan")
-            return form.read(path, options)
+            try:
+                with np.errstate(
+                    over="ignore", invalid="ignore"
+                ):  # inf and NaN: refused once they are points
+                    return form.read(path, options)
+            except OSError as error:
+                raise ValueError(f"{path}: not readable ({one_line(error)})") from error
     what = "a folder without .ply files" if path.is_dir() else f"suffix {path.suffix!r}"
     raise ValueError(f"{path}: {what}; needed a .ply, an .npz, or a folder of one .ply per object")
 
@@ -104,6 +111,10 @@ def _check_points(path: Path, points: Float[np.ndarray, "n 3"]) -> None:
         raise ValueError(f"{path}: no instances left; the scan has no points")
     if bad := int((~np.isfinite(points).all(axis=1)).sum()):
         raise ValueError(f"{path}: {bad} of {len(points)} points have NaN or infinite coordinates")
+    if bad := int((np.abs(points) > LARGEST_COORDINATE).any(axis=1).sum()):
+        raise ValueError(
+            f"{path}: {bad} of {len(points)} points have coordinates beyond {LARGEST_COORDINATE:g}"
+        )
 
 
 # --- from labelled points to instances ----------------------------------------------------------------------

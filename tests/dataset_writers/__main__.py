@@ -23,6 +23,11 @@ RGB = RNG.integers(0, 256, (60, 3)).astype(np.uint8)
 GROUPS = [(1, "chair", [1]), (2, "round table", [2])]
 
 
+def seen(points: np.ndarray) -> np.ndarray:
+    """The points on the wall that the depth frames of the fixture show, 1.5 m before the camera."""
+    return points * [1.4, 0.9, 0] + [0, 0, 1.5]
+
+
 def case(folder: Path, scan: Path, **options) -> None:
     """Describes the fixture: the scan's path and options of read_scan."""
     content = {"scan": str(scan.relative_to(folder)), "min_points": 4} | options
@@ -36,7 +41,7 @@ def plain(root: Path) -> None:
         case(folder, write_ply(folder / "room.ply", columns, [[0, 1, 2]], text=text))
     folder = root / "ply_folder" / "objects"
     for i in (1, 2):
-        write_ply(folder / f"chair_{i}.ply", vertex_columns(POINTS[IDS == i]), text=i == 1)
+        write_ply(folder / f"chair_{i}.ply", vertex_columns(POINTS[i == IDS]), text=i == 1)
     case(folder, folder)
     folder = root / "npz" / "labelled"
     folder.mkdir(parents=True)
@@ -90,14 +95,14 @@ def datasets(root: Path) -> None:
     quads = [[i, i + 1, i + 2, i + 3] for i in range(0, 60, 4)]
     case(folder, write_replica(folder, POINTS, quads, IDS[::4], {1: "chair", 2: "table"}))
     folder = root / "s3dis" / "office_1"
-    objects = {f"{n}_1": (POINTS[IDS == i], RGB[IDS == i]) for i, n in enumerate(("floor", "chair", "table"))}
+    objects = {f"{n}_1": (POINTS[i == IDS], RGB[i == IDS]) for i, n in enumerate(("floor", "chair", "table"))}
     case(folder, write_s3dis(folder, objects))
     for name, zipped in (("mesh", None), ("depth_zip", True), ("depth_folder", False)):
         folder = root / "threerscan" / name
-        write_annotated_mesh(folder, POINTS + [0, 0, 2], IDS, RGB)
+        write_annotated_mesh(folder, seen(POINTS), IDS, RGB)
         write_semseg(folder, {1: "chair", 2: "table"})
         if zipped is not None:
-            depth = np.full((6, 8), 2000, np.uint16)
+            depth = np.full((6, 8), 1500, np.uint16)
             camera = {"fx": 4.0, "fy": 4.0, "cx": 3.5, "cy": 2.5}
             write_sequence(folder, sequence_files([(depth, np.eye(4))] * 2, camera), zipped=zipped)
         case(folder, folder, **({} if zipped is None else {"depth_frames": True, "min_points": 1}))

@@ -4,7 +4,6 @@ import json
 from pathlib import Path
 
 import numpy as np
-
 from dataset_writers.ply_file import vertex_columns, write_ply
 
 

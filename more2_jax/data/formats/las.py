@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ from more2_jax.data.labelled import LabelledCloud, ReadOptions, instance_ids, on
 from more2_jax.data.ply import INSTANCE_PROPERTIES
 
 CHUNK = 1_000_000  # points read at once: a header that lies about their number costs no memory
+COMPRESSED = 0x80  # in the point format of LAZ
 COLORS = ("red", "green", "blue")
 
 
@@ -42,7 +44,8 @@ def _columns(path: Path, asked: str | None) -> tuple[dict[str, np.ndarray], list
     except ImportError as error:
         raise ValueError(f"{path}: needs the extra formats: pip install 'more2-jax[formats]'") from error
     try:
-        with laspy.open(path) as reader:
+        _check_header(path)
+        with laspy.open(path, read_evlrs=False, laz_backend=laspy.LazBackend.Lazrs) as reader:
             integers = _integers(reader.header.point_format)
             extra = set(reader.header.point_format.extra_dimension_names)
             has = set(reader.header.point_format.dimension_names)
@@ -53,6 +56,40 @@ def _columns(path: Path, asked: str | None) -> tuple[dict[str, np.ndarray], list
         raise ValueError(f"{path}: truncated or damaged LAS ({one_line(error)})") from error
     columns = zip(*chunks, strict=True) if chunks else [[np.zeros(0, np.int64)]] * len(names)
     return {n: np.concatenate(c) for n, c in zip(names, columns, strict=True)}, integers
+
+
+def _check_header(path: Path) -> None:
+    """Refuses counts that cannot fit into the file, before anyone loops over them."""
+    with path.open("rb") as file:
+        head = file.read(255).ljust(255, b"\0")
+    if head[:4] != b"LASF":
+        raise ValueError("it does not begin with LASF")
+    size = path.stat().st_size
+    header_size, points_at, records, form, width, count = struct.unpack_from("<HIIBHI", head, 94)
+    more_records, long_count = struct.unpack_from("<IQ", head, 243) if head[25] >= 4 else (0, 0)
+    count = max(count, long_count)
+    if header_size + 54 * records > points_at or points_at + 60 * more_records > size:
+        raise ValueError(f"{records} and {more_records} records do not fit into {size} bytes")
+    if not form & COMPRESSED and points_at + count * width > size:
+        raise ValueError(f"{count} points of {width} bytes do not fit into {size} bytes")
+    if form & COMPRESSED:
+        _check_chunks(path, points_at, size)
+
+
+def _check_chunks(path: Path, points_at: int, size: int) -> None:
+    """Refuses a table of LAZ chunks outside the file, or with more chunks than the file has bytes."""
+    with path.open("rb") as file:
+        file.seek(points_at)
+        (table_at,) = struct.unpack("<q", file.read(8).ljust(8, b"\0"))
+        if table_at == -1:  # written to a stream: it stands at the very end
+            file.seek(max(size - 8, 0))
+            (table_at,) = struct.unpack("<q", file.read(8).ljust(8, b"\0"))
+        if not points_at < table_at <= size - 8:
+            raise ValueError(f"its table of chunks is said to begin at byte {table_at} of {size}")
+        file.seek(table_at)
+        _, chunks = struct.unpack("<II", file.read(8))
+    if chunks > size:
+        raise ValueError(f"{chunks} chunks do not fit into {size} bytes")
 
 
 def _integers(point_format: Any) -> list[str]:

@@ -6,7 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from more2_jax.data.labelled import UNREADABLE, LabelledCloud, ReadOptions
+from more2_jax.data.labelled import LabelledCloud, ReadOptions, instance_ids
+from more2_jax.data.npz_file import read_arrays
 
 HOW = " (name the instances with --instance-property, or cut the scan with --segment geometric)"
 
@@ -18,12 +19,7 @@ def recognises(path: Path) -> bool:
 
 def read(path: Path, options: ReadOptions) -> LabelledCloud:
     key = options.instance_property or "instance"
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            arrays = {k: file[k] for k in ("points", key, "label", "color") if k in file.files}
-            names = ", ".join(file.files) or "nothing"
-    except UNREADABLE as error:
-        raise ValueError(f"{path}: not a readable NPZ file ({' '.join(str(error).split())})") from error
+    arrays, names = read_arrays(path, ("points", key, "label", "color"))
     segmented = not options.masks_needed and options.instance_property is None
     if missing := [k for k in ("points", *((key,) if not segmented else ())) if k not in arrays]:
         raise ValueError(f"{path}: arrays are {names}; needed {' and '.join(missing)} too" + HOW)
@@ -31,7 +27,7 @@ def read(path: Path, options: ReadOptions) -> LabelledCloud:
     labels = arrays.get("label") if key != "label" else None
     return LabelledCloud(
         points=arrays["points"].astype(np.float64),
-        instance=arrays[key].astype(np.int64) if key in arrays else None,
+        instance=instance_ids(path, arrays[key]) if key in arrays else None,
         colors=_colors(arrays.get("color")),
         point_labels=labels,
     )
