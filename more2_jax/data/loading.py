@@ -129,24 +129,29 @@ def training_samples(
 
     Raises ValueError for shards, processes or a batch that do not fit, or where JAX has no CPU to compute on.
     """
-    view = open_shards(folders, split)
-    records = training_records(view, config, seed, batch, process_index, process_count)
+    records = training_records(open_shards(folders, split), config, seed, batch, process_index, process_count)
     if start_step < 0 or threads < 1 or ahead < 1:
         raise ValueError(
             f"start_step {start_step}, threads {threads}, ahead {ahead}; needed >= 0, >= 1, >= 1"
         )
     import grain.python as grain
 
-    try:
-        cpu = jax.local_devices(backend="cpu")[0]
-    except RuntimeError as error:
-        raise ValueError("JAX has no CPU backend; needed JAX_PLATFORMS that names cpu too") from error
+    cpu = host()
 
     def sample(read: dict[str, Any]) -> TrainingSample:
         with jax.default_device(cpu):
             return jax.block_until_ready(sample_records(read, seed, config, points))
 
+    sample(dict(records[start_step] or {}))  # compiled once, here, and not by every thread at the same time
     options = grain.ReadOptions(num_threads=threads, prefetch_buffer_size=ahead)
     iterator = iter(records.map(sample).to_iter_dataset(options))
     iterator.set_state({"next_index": start_step})
     return iterator
+
+
+def host() -> jax.Device:
+    """JAX's CPU. ValueError where JAX was told to leave it out."""
+    try:
+        return jax.local_devices(backend="cpu")[0]
+    except RuntimeError as error:
+        raise ValueError("JAX has no CPU backend; needed JAX_PLATFORMS that names cpu too") from error
