@@ -11,6 +11,7 @@ import re
 import shutil
 import struct
 import zipfile
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 
@@ -106,7 +107,7 @@ def _damage_content(file: Path, data: bytes, rng: np.random.Generator) -> tuple[
                 return _inside_zip(data, change, rng), f"{name} in a member"
             if data[:8] == b"ASTM-E57":
                 return _inside_e57(data, change, rng), f"{name} below the checksums"
-        except (zipfile.BadZipFile, ValueError, NotImplementedError, OSError, RuntimeError, EOFError):
+        except (zipfile.BadZipFile, zlib.error, ValueError, OSError, RuntimeError, EOFError):
             pass  # damaged before: then from outside
     return change(data, rng), name
 

@@ -23,9 +23,10 @@ RGB = RNG.integers(0, 256, (60, 3)).astype(np.uint8)
 GROUPS = [(1, "chair", [1]), (2, "round table", [2])]
 
 
-def seen(points: np.ndarray) -> np.ndarray:
-    """The points on the wall that the depth frames of the fixture show, 1.5 m before the camera."""
-    return points * [1.4, 0.9, 0] + [0, 0, 1.5]
+def wall() -> np.ndarray:
+    """What the depth frames of the fixture show, 1.5 m before the camera: a point a pixel."""
+    v, u = np.divmod(np.arange(48), 8)
+    return np.stack([(u - 3.5) * 1.5 / 4, (v - 2.5) * 1.5 / 4, np.full(48, 1.5)], axis=-1)
 
 
 def case(folder: Path, scan: Path, **options) -> None:
@@ -99,7 +100,7 @@ def datasets(root: Path) -> None:
     case(folder, write_s3dis(folder, objects))
     for name, zipped in (("mesh", None), ("depth_zip", True), ("depth_folder", False)):
         folder = root / "threerscan" / name
-        write_annotated_mesh(folder, seen(POINTS), IDS, RGB)
+        write_annotated_mesh(folder, wall(), IDS[12:], RGB[12:])
         write_semseg(folder, {1: "chair", 2: "table"})
         if zipped is not None:
             depth = np.full((6, 8), 1500, np.uint16)

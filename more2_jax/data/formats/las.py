@@ -12,8 +12,14 @@ from jaxtyping import Int
 from more2_jax.data.labelled import LabelledCloud, ReadOptions, instance_ids, one_line
 from more2_jax.data.ply import INSTANCE_PROPERTIES
 
-CHUNK = 1_000_000  # points read at once: a header that lies about their number costs no memory
+CHUNK = 64_000_000  # bytes of points read at once: a header that lies about their number costs no memory
 COMPRESSED = 0x80  # in the point format of LAZ
+LAYERS = {
+    10: 9,
+    11: 1,
+    12: 2,
+    13: 1,
+}  # of LAZ items: point, RGB, RGB with infrared, wave packet; else one a byte
 COLORS = ("red", "green", "blue")
 
 
@@ -40,7 +46,7 @@ def _columns(path: Path, asked: str | None) -> tuple[dict[str, np.ndarray], list
     """Coordinates, colours and what may name instances; with the names of all integer dimensions."""
     try:
         import laspy
-        import lazrs  # noqa: F401 (laspy finds it by itself)
+        import lazrs
     except ImportError as error:
         raise ValueError(f"{path}: needs the extra formats: pip install 'more2-jax[formats]'") from error
     try:
@@ -50,9 +56,13 @@ def _columns(path: Path, asked: str | None) -> tuple[dict[str, np.ndarray], list
             extra = set(reader.header.point_format.extra_dimension_names)
             has = set(reader.header.point_format.dimension_names)
             wanted = {name for name in INSTANCE_PROPERTIES if name in extra} | ({asked} if asked else set())
+            _check_layers(path, reader.header, lazrs)
+            rows = max(1, CHUNK // max(1, reader.header.point_format.size))
             names = ["x", "y", "z", *(c for c in COLORS if c in has), *(n for n in integers if n in wanted)]
-            chunks = [[np.array(chunk[name]) for name in names] for chunk in reader.chunk_iterator(CHUNK)]
-    except Exception as error:
+            chunks = [[np.array(chunk[name]) for name in names] for chunk in reader.chunk_iterator(rows)]
+    except (KeyboardInterrupt, SystemExit):
+        raise
+    except BaseException as error:  # a panic of lazrs, which is written in Rust, is no Exception
         raise ValueError(f"{path}: truncated or damaged LAS ({one_line(error)})") from error
     columns = zip(*chunks, strict=True) if chunks else [[np.zeros(0, np.int64)]] * len(names)
     return {n: np.concatenate(c) for n, c in zip(names, columns, strict=True)}, integers
@@ -90,6 +100,28 @@ def _check_chunks(path: Path, points_at: int, size: int) -> None:
         _, chunks = struct.unpack("<II", file.read(8))
     if chunks > size:
         raise ValueError(f"{chunks} chunks do not fit into {size} bytes")
+
+
+def _check_layers(path: Path, header: Any, lazrs: Any) -> None:
+    """Refuses chunks whose layers (point formats from 6 on) are said to be longer than the chunk itself."""
+    if not header.are_points_compressed or header.point_format.id < 6:
+        return
+    record = bytes(header.vlrs[header.vlrs.index("LasZipVlr")].record_data)
+    (count,) = struct.unpack_from("<H", record, 32)
+    items = [struct.unpack_from("<HH", record, 34 + 6 * i) for i in range(count)]
+    first = sum(size for _, size in items)  # bytes of the chunk's first point, which is stored plain
+    layers = sum(LAYERS.get(kind, size) for kind, size in items)
+    at = header.offset_to_point_data
+    with path.open("rb") as file:
+        file.seek(at)
+        chunks = lazrs.read_chunk_table(file, lazrs.LazVlr(record))
+        at += 8  # the place of the table itself
+        for _, size in chunks:
+            file.seek(at + first + 4)
+            said = np.frombuffer(file.read(4 * layers).ljust(4 * layers, b"\0"), "<u4")
+            if said.sum(dtype=np.uint64) > size:
+                raise ValueError(f"a chunk of {size} bytes claims layers of {said.sum(dtype=np.uint64)}")
+            at += size
 
 
 def _integers(point_format: Any) -> list[str]:
