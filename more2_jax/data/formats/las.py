@@ -115,6 +115,8 @@ def _check_layers(path: Path, header: Any, lazrs: Any) -> None:
     with path.open("rb") as file:
         file.seek(at)
         chunks = lazrs.read_chunk_table(file, lazrs.LazVlr(record))
+        if (room := sum(points for points, _ in chunks)) < header.point_count:
+            raise ValueError(f"its chunks hold {room} points; the header says {header.point_count}")
         at += 8  # the place of the table itself
         for _, size in chunks:
             file.seek(at + first + 4)
