@@ -149,8 +149,8 @@ def training_samples(
     return iterator
 
 
-def host() -> jax.Device:
-    """JAX's CPU. ValueError where JAX was told to leave it out."""
+def host() -> Any:
+    """JAX's CPU device. ValueError where JAX was told to leave it out."""
     try:
         return jax.local_devices(backend="cpu")[0]
     except RuntimeError as error:
