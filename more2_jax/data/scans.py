@@ -53,8 +53,6 @@ def read_scan(
     path = Path(path)
     if unit not in UNITS_M or segment not in (None, "geometric"):
         raise ValueError(f"unit {unit!r}, segment {segment!r}; needed m, cm or mm; geometric or None")
-    if not path.exists():
-        raise ValueError(f"{path}: no such file or folder")
     options = ReadOptions(
         instance_property=instance_property,
         masks=None if masks is None else Path(masks),
@@ -91,6 +89,8 @@ def _segmented(path: Path, cloud: LabelledCloud, unit: str) -> LabelledCloud:
 
 def _read(path: Path, options: ReadOptions) -> LabelledCloud:
     """What the first format that recognises the path reads."""
+    if not path.exists():
+        raise ValueError(f"{path}: no such file or folder")
     for form in FORMATS:
         if form.recognises(path):
             if options.depth_frames and form not in WITH_DEPTH_FRAMES:
