@@ -78,7 +78,18 @@ def make(job: synthesise.Job, folder: Path, regime: str, *, free: bool = False, 
     return one.out / f"scene_{number:04d}"
 
 
-@pytest.fixture(scope="module", params=[(r, f) for r in REGIMES for f in (False, True)], ids=str)
+CASES = [
+    pytest.param(
+        (r, f),
+        id=f"{r}-{'free' if f else 'upright'}",
+        marks=[pytest.mark.slow] if f and r != "sparse" else [],
+    )
+    for r in REGIMES
+    for f in (False, True)
+]
+
+
+@pytest.fixture(scope="module", params=CASES)
 def scene(request, models, tmp_path_factory) -> tuple[FlyingScene, bool, Path]:
     regime, free = request.param
     folder = make(models, tmp_path_factory.mktemp("made"), regime, free=free)
@@ -264,7 +275,7 @@ def test_units_axes_and_licences_of_a_source(source):
         scale = 2.0 / np.ptp(a.vertices, axis=0).max()
         np.testing.assert_allclose(np.ptp(b.vertices, axis=0), scale * np.ptp(a.vertices, axis=0)[[0, 2, 1]])
         assert b.licence == "CC0"  # the source's own word counts
-    with pytest.raises(ValueError, match="category 'crate'; needed one of seat"):
+    with pytest.raises(ValueError, match="category 'shelf'; needed one of seat"):
         read_models(source, longest_m={"seat": 1.0})
 
 

@@ -31,7 +31,7 @@ from more2_jax.data.furnishing import REGIMES, Regime, furniture, scene_config
 from more2_jax.data.meshes import SourceMesh
 from train.program import run
 
-ATTEMPTS = 5  # at furnishing a scene, before the room is called impossible
+ATTEMPTS = 4  # at furnishing a scene, before the room is called impossible
 
 
 def main(

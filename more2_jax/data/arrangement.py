@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 from jaxtyping import Float
@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from more2_jax.data.flying_shape import Pose, footprint_radius, free_spot
 
 TRIES = 500
+DENSEST = 1.0  # share of the floor that circles cannot exceed
 Circle = tuple[float, float, float]  # x, y, radius, metres
 DECIMALS = 9  # of a pose: last bits, which differ between processors, are gone
 
@@ -30,6 +31,8 @@ def arrange(
     Static objects stay where they were `before`; the others come to stand `moved_m` (least, most) from there.
     Raises ValueError when the room is too full.
     """
+    if not free:
+        _check_room([footprint_radius(v) for v in present.values()], room_m)
     for _ in range(TRIES):
         poses = {n: before[n] for n in present if n in static and n in before}
         taken = [circle(present[n], p, free) for n, p in poses.items()]
@@ -45,6 +48,16 @@ def arrange(
     raise ValueError(
         f"no arrangement of {len(present)} objects in {room_m[0]} × {room_m[1]} m; needed more room"
     )
+
+
+def _check_room(radii: Sequence[float], room_m: tuple[float, float]) -> None:
+    """Raises ValueError if no arrangement of the circles exists, so that none is looked for."""
+    area = np.pi * sum(r * r for r in radii)
+    if 2 * max(radii, default=0.0) > min(room_m) or area > DENSEST * room_m[0] * room_m[1]:
+        raise ValueError(
+            f"{len(radii)} objects on {area:.1f} m², the largest {2 * max(radii):.2f} m across, in"
+            f" {room_m[0]} × {room_m[1]} m; needed more room"
+        )
 
 
 def circle(vertices: Float[np.ndarray, "v 3"], pose: Pose, free: bool) -> Circle:

@@ -64,7 +64,7 @@ def free_spot(
     room: tuple[float, float],
 ) -> tuple[float, float]:
     """A place whose circle touches no other's (x, y, radius) and no wall; ValueError if none is found."""
-    for _ in range(2000):
+    for _ in range(300):
         x, y = (rng.uniform(-side / 2 + radius, side / 2 - radius) for side in room)
         if all((x - a) ** 2 + (y - b) ** 2 > (radius + r) ** 2 for a, b, r in taken):
             return float(x), float(y)
