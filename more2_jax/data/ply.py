@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -80,7 +81,10 @@ def read_elements(path: Path) -> PlyData:
     for corners in (3, 4, None):
         known = {} if corners is None else {"face": dict.fromkeys(CORNERS, corners)}
         try:
-            return PlyData.read(str(path), known_list_len=known)
+            with warnings.catch_warnings(
+                action="ignore", category=UserWarning
+            ):  # NumPy's, of faces cut short
+                return PlyData.read(str(path), known_list_len=known)
         except (PlyParseError, ValueError, TypeError, EOFError, OverflowError, MemoryError, OSError) as error:
             reason = error
     raise ValueError(
