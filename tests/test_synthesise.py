@@ -240,7 +240,7 @@ def test_bad_input_is_one_line(source, tmp_path):
     def refusal(**settings) -> str:
         given = {"source": source, "regime": "paper", "out": tmp_path / "x", "scenes": 1} | settings
         with pytest.raises(ValueError) as raised:
-            synthesise.main(**given)
+            synthesise.main(synthesise.Settings(**given))
         assert "\n" not in str(raised.value)
         return str(raised.value)
 

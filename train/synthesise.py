@@ -19,9 +19,10 @@ from dataclasses import dataclass
 from functools import lru_cache, partial
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
+import tyro
 from rich.progress import track
 
 from more2_jax.data.benchmark import write_scene
@@ -34,64 +35,69 @@ from train.program import run
 ATTEMPTS = 4  # at furnishing a scene, before the room is called impossible
 
 
-def main(
-    source: Path,
-    regime: str,
-    out: Path,
-    scenes: int = 100,
-    seed: int = 0,
-    free: bool = False,
-    scans: int = 5,
-    up: Literal["y", "z"] = "z",
-    longest_m: float | None = None,
-    licence: str | None = None,
-    attribution: str | None = None,
-    room_m: tuple[float, float] = (7.0, 6.0),
-    cache: Path | None = None,
-    workers: int = 0,
-) -> None:
-    """Writes scenes with ground truth, index.json, LICENSES.md and report.json (models left out, and why).
+@dataclass(frozen=True, kw_only=True)
+class Settings:
+    """What to make, and from what."""
 
-    Args:
-        source: folder of meshes, packed .npz, or whatever else train.prepare reads.
-        regime: paper, sparse, identical or changes.
-        out: folder of the scenes.
-        scenes: how many.
-        seed: of everything.
-        free: any orientation, not only upright.
-        scans: visits a scene.
-        up: the source's vertical axis (heldout_ikea.npz is known).
-        longest_m: scales every mesh to this longest edge; without it the source is in metres.
-        licence: of meshes that come without one.
-        attribution: who is to be named, for LICENSES.md.
-        room_m: floor, x by y.
-        cache: folder of closed models, to share between benchmarks; inside `out` otherwise.
-        workers: processes; 0 for one a core.
-    """
-    scene_config(_regime(regime), scans, np.random.default_rng(0), free=free)
-    if scenes < 1 or seed < 0 or min(room_m) <= 0:
-        raise ValueError(f"{scenes} scenes, seed {seed}, room {room_m}; needed positive numbers, seed from 0")
+    source: Path
+    """Folder of meshes, packed .npz, or whatever else train.prepare reads."""
+    regime: str
+    """paper, sparse, identical or changes."""
+    out: Path
+    """Folder of the scenes."""
+    scenes: int = 100
+    """How many."""
+    seed: int = 0
+    """Of everything."""
+    free: bool = False
+    """Any orientation, not only upright."""
+    scans: int = 5
+    """Visits a scene."""
+    up: Literal["y", "z"] = "z"
+    """The source's vertical axis (heldout_ikea.npz is known)."""
+    longest_m: float | None = None
+    """Scales every mesh to this longest edge; without it the source is in metres."""
+    licence: str | None = None
+    """Of meshes that come without one."""
+    attribution: str | None = None
+    """Who is to be named, for LICENSES.md."""
+    room_m: tuple[float, float] = (7.0, 6.0)
+    """Floor, x by y."""
+    cache: Path | None = None
+    """Folder of closed models, to share between benchmarks; inside `out` otherwise."""
+    workers: int = 0
+    """Processes; 0 for one a core."""
+
+
+def main(settings: Annotated[Settings, tyro.conf.arg(name="")]) -> None:
+    """Writes scenes with ground truth, index.json, LICENSES.md and report.json (models left out, and why)."""
+    s = settings
+    scene_config(_regime(s.regime), s.scans, np.random.default_rng(0), free=s.free)
+    if s.scenes < 1 or s.seed < 0 or min(s.room_m) <= 0:
+        raise ValueError(
+            f"{s.scenes} scenes, seed {s.seed}, room {s.room_m}; needed positive numbers, seed from 0"
+        )
     unreadable: dict[str, str] = {}
-    meshes = read_models(source, up=up, longest_m=longest_m, licence=licence, unreadable=unreadable)
+    meshes = read_models(s.source, up=s.up, longest_m=s.longest_m, licence=s.licence, unreadable=unreadable)
     job = Job(
         meshes=tuple(meshes),
-        cache=cache or out / "models",
-        out=out,
-        regime=_regime(regime),
-        free=free,
-        scans=scans,
-        seed=seed,
-        room_m=room_m,
+        cache=s.cache or s.out / "models",
+        out=s.out,
+        regime=_regime(s.regime),
+        free=s.free,
+        scans=s.scans,
+        seed=s.seed,
+        room_m=s.room_m,
     )
     claim(job)
-    with processes(job, workers) as pool:
+    with processes(job, s.workers) as pool:
         rejected = check_models(job, pool)
-        _write(out / "report.json", {"rejected": rejected, "unreadable": unreadable})
-        usable = len(meshes) - len(rejected)
-        digests = make_scenes(job, scenes, pool)
-    _write(out / "index.json", {**job.facts, "scenes": digests})
-    write_licences(out, attribution)
-    print(f"{scenes} scenes of {scans} scans from {usable} models, {len(rejected)} rejected, in {out}")
+        _write(s.out / "report.json", {"rejected": rejected, "unreadable": unreadable})
+        digests = make_scenes(job, s.scenes, pool)
+    _write(s.out / "index.json", {**job.facts, "scenes": digests})
+    write_licences(s.out, s.attribution)
+    usable = len(meshes) - len(rejected)
+    print(f"{s.scenes} scenes of {s.scans} scans from {usable} models, {len(rejected)} rejected, in {s.out}")
 
 
 def _regime(name: str) -> Regime:
