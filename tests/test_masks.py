@@ -129,3 +129,10 @@ def test_a_folder_must_have_the_scans_masks(tmp_path, scan):
         read_scan(scan, masks=tmp_path / "out")
     with pytest.raises(ValueError, match="no such file"):
         read_scan(scan, masks=tmp_path / "none")
+
+
+def test_names_from_a_file_cannot_break_the_line(tmp_path):
+    path = write_ply(tmp_path / "a.ply", vertex_columns(POINTS, name=np.ones(400, np.int32)))
+    path.write_bytes(path.read_bytes().replace(b"int name", b"int n\x1bme"))
+    with pytest.raises(ValueError, match=r"integer properties are n\?me"):
+        read_scan(path)

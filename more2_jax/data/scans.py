@@ -102,6 +102,10 @@ def _read(path: Path, options: ReadOptions) -> LabelledCloud:
                     return form.read(path, options)
             except OSError as error:
                 raise ValueError(f"{path}: not readable ({one_line(error)})") from error
+            except ValueError as error:
+                if str(error).isprintable():
+                    raise
+                raise ValueError(one_line(error)) from error  # names from the file may hold anything
     what = "a folder without .ply files" if path.is_dir() else f"suffix {path.suffix!r}"
     raise ValueError(f"{path}: {what}; needed a .ply, an .npz, or a folder of one .ply per object")
 
