@@ -4,10 +4,11 @@ import json
 
 import numpy as np
 import pytest
-from dataset_writers.__main__ import write_fixtures
 
 pytest.importorskip("laspy")
 pytest.importorskip("pye57")
+from dataset_writers.__main__ import write_fixtures
+
 import eval.fuzz_readers as fuzz
 from eval.mutations import PAGE, _crc32c
 from more2_jax.data.scans import read_scan
