@@ -46,7 +46,7 @@ def total_loss(
     embedding, predicted = predict(prior, sample, dropout_key, train=True)
     terms = {
         "sdf": sdf_loss(predicted, sample.sdf, config.near_surface),
-        "center": jnp.mean(jnp.linalg.norm(embedding.center + 1e-12, axis=-1)),
+        "center": jnp.mean(jnp.linalg.norm(embedding.center - sample.center + 1e-12, axis=-1)),
         # Where the paper has |1 − F_s|: the same minimum and slope there, but a scale that shrinks towards 0,
         # where |1 − F_s| has no pull left on the product of all layers, is pushed back.
         "scale": jnp.mean(jnp.abs(jnp.log(embedding.scale))),

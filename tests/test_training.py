@@ -30,13 +30,13 @@ def shards(tmp_path_factory):
     queries = rng.uniform(-0.55, 0.55, (40, 200, 3))
     distance = np.linalg.norm(queries, axis=-1) - radius[:, None]
     sdf = np.concatenate([queries, distance[..., None]], axis=-1).astype(np.float16)
-    np.savez(
-        folder / "shard_000.npz",
-        views=(unit * radius[:, None, None, None]).astype(np.float16),
-        sdf_uniform=sdf,
-        sdf_near=sdf,
-        splits=np.array(["val" if k % 5 == 0 else "train" for k in range(40)]),
-    )
+    arrays = {"views": unit * radius[:, None, None, None], "sdf_uniform": sdf, "sdf_near": sdf}
+    shard = folder / "shard_000"
+    shard.mkdir()
+    for name, array in arrays.items():
+        np.save(shard / f"{name}.npy", array.astype(np.float16))
+    meta = [{"name": f"sphere_{k}", "split": "val" if k % 5 == 0 else "train"} for k in range(40)]
+    (shard / "meta.json").write_text(json.dumps(meta))
     return folder
 
 
@@ -85,11 +85,11 @@ def test_a_resumed_run_equals_one_that_was_not_stopped(shards, run, tmp_path):
     long = tmp_path / "long.yaml"
     training = dataclasses.replace(run.training, steps=8, validate_every=4)
     long.write_text(to_yaml(dataclasses.replace(run, training=training)))
-    main(long, shards, tmp_path / "whole", name="sphere")
+    main(long, (shards,), tmp_path / "whole", name="sphere")
     # Stopped at its first checkpoint, as a killed run would leave it: the second is taken away.
-    main(long, shards, tmp_path / "parts", name="sphere")
+    main(long, (shards,), tmp_path / "parts", name="sphere")
     shutil.rmtree(tmp_path / "parts" / "checkpoints" / "8")
-    main(long, shards, tmp_path / "parts", name="sphere")
+    main(long, (shards,), tmp_path / "parts", name="sphere")
     whole, parts = (load_prior(tmp_path / k / "weights.npz") for k in ("whole", "parts"))
     for a, b in zip(jax.tree.leaves(whole.params), jax.tree.leaves(parts.params), strict=True):
         np.testing.assert_array_equal(a, b)
@@ -101,5 +101,5 @@ def test_a_resumed_run_equals_one_that_was_not_stopped(shards, run, tmp_path):
 def test_a_run_without_shards_says_so(run, tmp_path):
     config = tmp_path / "c.yaml"
     config.write_text(to_yaml(run))
-    with pytest.raises(ValueError, match="no train shapes"):
-        main(config, tmp_path, tmp_path / "out")
+    with pytest.raises(ValueError, match="no shards"):
+        main(config, (tmp_path,), tmp_path / "out")

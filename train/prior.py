@@ -41,12 +41,14 @@ class TrainingState:
     step: Array
 
 
-def main(config: Path, shards: Path, out: Path, minutes: float = math.inf, name: str = "") -> None:
+def main(
+    config: Path, shards: tuple[Path, ...], out: Path, minutes: float = math.inf, name: str = ""
+) -> None:
     """Trains until the configured number of steps, or for `minutes`.
 
     Args:
         config: YAML with `model` and `training`.
-        shards: folder that `python -m train.prepare` wrote.
+        shards: folders that `python -m train.prepare` wrote.
         out: checkpoints, log.jsonl and weights.npz.
         minutes: wall-clock budget.
         name: of the weights; by default the configuration file's.

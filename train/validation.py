@@ -21,9 +21,7 @@ BATCH = 32
 
 def validate(prior: Prior, shapes: Shapes, config: TrainingConfig) -> dict[str, float]:
     """Means over up to 192 shapes, clean clouds of up to three views: the same samples at every call."""
-    clean = dataclasses.replace(
-        config, max_views=3, crop_probability=0.0, ball_probability=0.0, junk_probability=0.0, queries=1024
-    )
+    clean = dataclasses.replace(config, max_views=3, augment_probability=0.0, queries=1024)
     count = min(192, len(shapes.views)) // GROUP * GROUP
     batch = min(BATCH, count)
     rows = [

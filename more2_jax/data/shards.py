@@ -23,7 +23,8 @@ from more2_jax.data.shapes import Shape
 from more2_jax.data.source_mesh import SourceMesh
 from more2_jax.types import pytree
 
-ARRAYS = ("views", "sdf_uniform", "sdf_near", "fingerprint")
+MAPPED = ("views", "sdf_uniform", "sdf_near")  # what samples are drawn from
+ARRAYS = (*MAPPED, "fingerprint")
 EXCLUDED = "excluded.json"
 
 
@@ -104,7 +105,7 @@ def open_shards(folders: str | Path | Sequence[str | Path], split: str) -> Shard
             if chosen:
                 rows += [(len(shards), k) for k in chosen]
                 meta += [found[k] for k in chosen]
-                shards.append({n: np.load(shard / f"{n}.npy", mmap_mode="r") for n in ARRAYS[:3]})
+                shards.append({n: np.load(shard / f"{n}.npy", mmap_mode="r") for n in MAPPED})
     if not rows:
         raise ValueError(
             f"{', '.join(map(str, given))}: no {split} shapes; `python -m train.prepare` makes them"
