@@ -44,13 +44,13 @@ def main(
     training, points = settings.training, settings.model.encoder.points
     records = training_records(open_shards(shards, "train"), training, training.seed, batch)
     table = Table("stage", "cores", "samples/s", "clouds/s", "clouds/s a core")
-    pinned = pin(cores or 1)
-    read = dict(records[0] or {})
-    for name, work in (
-        ("reading", lambda step: records[step]),
-        ("sampling", lambda _: sample_records(read, training.seed, training, points).sdf.block_until_ready()),
-    ):
-        add_row(table, name, pinned, rate(work, seconds, batch))
+    pinned, read = pin(cores or 1), dict(records[0] or {})
+
+    def sample(_: int) -> None:
+        sample_records(read, training.seed, training, points).sdf.block_until_ready()
+
+    add_row(table, "reading", pinned, rate(lambda step: records[step], seconds, batch))
+    add_row(table, "sampling", pinned, rate(sample, seconds, batch))
     for count in threads:
         pinned = pin(cores or count)
         loader = training_samples(
