@@ -38,7 +38,7 @@ def main(
     """
     if min(threads, default=0) < 1 or seconds <= 0 or batch < 1 or cores < 0:
         raise ValueError(
-            "threads, seconds, batch or cores out of range; needed threads >= 1, seconds > 0, batch >= 1"
+            f"threads {threads}, seconds {seconds}, batch {batch}, cores {cores}; needed 1 or more"
         )
     settings = load_config(config, TrainingRun)
     training, points = settings.training, settings.model.encoder.points
