@@ -36,10 +36,7 @@ def main(
         seconds: measured for each figure, after a warm-up.
         batch: rows a batch.
     """
-    if min(threads, default=0) < 1 or seconds <= 0 or batch < 1 or cores < 0:
-        raise ValueError(
-            f"threads {threads}, seconds {seconds}, batch {batch}, cores {cores}; needed 1 or more"
-        )
+    check_positive(threads=min(threads, default=0), seconds=seconds, batch=batch, cores=cores + 1)
     settings = load_config(config, TrainingRun)
     training, points = settings.training, settings.model.encoder.points
     records = training_records(open_shards(shards, "train"), training, training.seed, batch)
@@ -60,6 +57,13 @@ def main(
         add_row(table, f"loader, {count} thread{'s' * (count > 1)}", pinned, speed)
         loader.close()
     Console().print(table)
+
+
+def check_positive(**values: float) -> None:
+    """Raises ValueError for a value that is not above 0."""
+    for name, value in values.items():
+        if value <= 0:
+            raise ValueError(f"{name} {value}; needed more than 0")
 
 
 def pin(cores: int) -> int:
