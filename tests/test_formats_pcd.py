@@ -8,6 +8,8 @@ import pytest
 from more2_jax.data.formats import pcd
 from more2_jax.data.labelled import ReadOptions
 from more2_jax.data.lzf import decompress
+from more2_jax.data.scans import read_scan
+from tests.dataset_writers.masks import write_masks
 from tests.dataset_writers.pcd import lzf, write_pcd
 
 ENCODINGS = ("ascii", "binary", "binary_compressed")
@@ -41,6 +43,39 @@ def test_points_without_depth_are_left_out_and_counted(tmp_path: Path, data: str
     np.testing.assert_array_equal(cloud.instance, np.delete(wrote["label"], [3, 4, 5]))
     assert cloud.warnings[0].startswith("3 of 40 points")
     assert "VIEWPOINT 0 0 0 0 1 0 0 is not applied" in cloud.warnings[1]
+
+
+@pytest.mark.parametrize("form", ["npz", "per point", "txt"])
+def test_masks_speak_of_the_rows_of_the_file(tmp_path: Path, form: str):
+    wrote = {k: v for k, v in fields().items() if k in "xyz"}
+    wrote["y"][[2, 5, 17, 30]] = np.nan
+    path = write_pcd(tmp_path / "a.pcd", wrote, "binary")
+    masks = np.zeros((40, 3), bool)
+    masks[0:16, 0] = masks[16:36, 1] = masks[[2, 5], 2] = True  # the third covers no measured point
+    if form == "txt":
+        file = write_masks(tmp_path / "m.txt", masks, (1, 2, 3), (0.8, 0.7, 0.9))
+    elif form == "npz":
+        file = tmp_path / "m.npz"
+        np.savez(file, masks=masks, scores=np.array([0.8, 0.7, 0.9]))
+    else:
+        file = tmp_path / "m.npz"
+        np.savez(file, instance=masks @ [1, 2, 0])
+    read = read_scan(path, masks=file, min_points=1)
+    whole = np.stack([wrote[a] for a in "xyz"], axis=-1)
+    for instance, column in zip(read.instances, (0, 1), strict=True):
+        rows = masks[:, column] & np.isfinite(whole).all(axis=1)
+        np.testing.assert_array_equal(instance.points, whole[rows])
+    if form != "per point":
+        assert [s.reason for s in read.skipped] == ["covers no point"]
+
+
+def test_masks_of_the_measured_points_alone_are_refused(tmp_path: Path):
+    wrote = {k: v for k, v in fields().items() if k in "xyz"}
+    wrote["z"][:4] = np.nan
+    path = write_pcd(tmp_path / "a.pcd", wrote, "binary")
+    np.savez(tmp_path / "m.npz", instance=np.ones(36, int))
+    with pytest.raises(ValueError, match="for 36 points; the scan has 40"):
+        read_scan(path, masks=tmp_path / "m.npz", min_points=1)
 
 
 def test_no_masks_are_said_or_welcome(tmp_path: Path):

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from more2_jax.types import Skipped
 
@@ -47,6 +47,12 @@ class LabelledCloud:
     skipped: tuple[Skipped, ...] = ()
     unit: str | None = None  # m, cm or mm where the format fixes it, whatever the caller says
     warnings: tuple[str, ...] = ()
+    rows: Bool[np.ndarray, "r"] | None = None  # which rows of the file the points are; None: all
+
+    @property
+    def file_rows(self) -> int:
+        """Rows of the file, those left out counted: what masks beside it speak of."""
+        return len(self.points) if self.rows is None else len(self.rows)
 
 
 def one_line(error: BaseException) -> str:

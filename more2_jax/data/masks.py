@@ -31,7 +31,7 @@ def lay_masks(cloud: LabelledCloud, scan: Path, path: Path, min_score: float) ->
     `path` is a benchmark file (`<scene>.txt`, a line an instance: mask file, class, score), an NPZ with `masks`
     (n, k) and optional `scores` (k,), `labels` (k,), an NPZ with `objectId` (n,), or a folder that holds such a
     file under the scan's name. A point under several masks belongs to that with the highest score, of equal ones
-    to the first. Masks scored below `min_score` and those left without points are reported as skipped.
+    to the first. Masks speak of the file's rows, those without depth counted. Masks scored below `min_score` and those left without points are reported as skipped.
 
     Raises ValueError, in one line, when files are missing or malformed or do not speak of the cloud's points.
     """
@@ -41,11 +41,17 @@ def lay_masks(cloud: LabelledCloud, scan: Path, path: Path, min_score: float) ->
         arrays = _arrays(file)
         if key := next((k for k in PER_POINT if k in arrays and "masks" not in arrays), None):
             _check_count(file, key, arrays[key], cloud)
-            return replace(bare, instance=instance_ids(file, arrays[key]))
+            return replace(bare, instance=_of_points(cloud, instance_ids(file, arrays[key])))
         masks = _from_arrays(file, arrays, cloud)
     else:
         masks = _from_benchmark(file, cloud)
+    masks = [replace(mask, covers=_of_points(cloud, mask.covers)) for mask in masks]
     return _laid(bare, masks, min_score)
+
+
+def _of_points(cloud: LabelledCloud, values: np.ndarray) -> np.ndarray:
+    """Values of the file's rows at those rows that are points: a range camera's file has rows without depth."""
+    return values if cloud.rows is None else values[cloud.rows]
 
 
 def _laid(cloud: LabelledCloud, masks: list[Mask], min_score: float) -> LabelledCloud:
@@ -82,9 +88,9 @@ def _of_scan(scan: Path, path: Path) -> Path:
 
 
 def _check_count(file: Path, name: str, values: np.ndarray, cloud: LabelledCloud) -> None:
-    if values.shape != (len(cloud.points),):
+    if values.shape != (cloud.file_rows,):
         found = len(values) if values.ndim == 1 else values.shape
-        raise ValueError(f"{file}: {name} is for {found} points; the scan has {len(cloud.points)}")
+        raise ValueError(f"{file}: {name} is for {found} points; the scan has {cloud.file_rows}")
     if values.dtype.kind not in "iub":
         raise ValueError(f"{file}: {name} holds {values.dtype}; needed integers")
 
@@ -100,7 +106,7 @@ def _arrays(file: Path) -> dict[str, np.ndarray]:
 
 
 def _from_arrays(file: Path, arrays: dict[str, np.ndarray], cloud: LabelledCloud) -> list[Mask]:
-    masks, n = arrays["masks"], len(cloud.points)
+    masks, n = arrays["masks"], cloud.file_rows
     if masks.ndim != 2 or len(masks) != n:
         raise ValueError(f"{file}: masks have shape {masks.shape}; needed ({n}, instances) for this scan")
     if masks.dtype.kind not in "biuf":
@@ -134,7 +140,7 @@ def _from_benchmark(file: Path, cloud: LabelledCloud) -> list[Mask]:
         lines = file.read_text(encoding="utf-8").splitlines()
     except (OSError, ValueError) as error:
         raise ValueError(f"{file}: not a readable text file ({one_line(error)})") from error
-    return [_mask(file, i, line, len(cloud.points)) for i, line in enumerate(lines, 1) if line.strip()]
+    return [_mask(file, i, line, cloud.file_rows) for i, line in enumerate(lines, 1) if line.strip()]
 
 
 def _mask(file: Path, number: int, line: str, n: int) -> Mask:

@@ -45,7 +45,10 @@ def recognises(path: Path) -> bool:
 
 
 def read(path: Path, options: ReadOptions) -> LabelledCloud:
-    """Coordinates as they are stored: VIEWPOINT is stated, not applied. Points without depth are left out."""
+    """Coordinates as they are stored: VIEWPOINT is stated, not applied. Points without depth are left out.
+
+    `rows` of the cloud says which were kept: masks beside the file speak of all its rows.
+    """
     content = path.read_bytes()
     try:
         header, body = _header(content)
@@ -68,6 +71,7 @@ def read(path: Path, options: ReadOptions) -> LabelledCloud:
         colors=None if colors is None else colors[valid],
         point_labels=labels[valid] if labels is not None and labels.dtype.kind in "iu" else None,
         warnings=_warnings(header, int((~valid).sum())),
+        rows=valid,
     )
 
 
