@@ -30,8 +30,9 @@ def lay_masks(cloud: LabelledCloud, scan: Path, path: Path, min_score: float) ->
 
     `path` is a benchmark file (`<scene>.txt`, a line an instance: mask file, class, score), an NPZ with `masks`
     (n, k) and optional `scores` (k,), `labels` (k,), an NPZ with `objectId` (n,), or a folder that holds such a
-    file under the scan's name. A point under several masks belongs to that with the highest score, of equal ones
-    to the first. Masks speak of the file's rows, those without depth counted. Masks scored below `min_score` and those left without points are reported as skipped.
+    file under the scan's name; n counts the rows of the scan's file, those without depth too. A point under
+    several masks belongs to that with the highest score, of equal ones to the first. Masks scored below
+    `min_score` and those left without points are reported as skipped.
 
     Raises ValueError, in one line, when files are missing or malformed or do not speak of the cloud's points.
     """
