@@ -58,8 +58,8 @@ def view_hits(
     """First hits of the pixels' rays of the camera on the side `toward`, and the faces that were hit."""
     rays = pixel_rays(toward)
     eyes = np.tile(DISTANCE * toward, (len(rays), 1))
-    hits, _, face = caster.intersects_location(eyes, rays, multiple_hits=False)
-    return hits, face
+    found = caster.intersects_location(eyes, rays, multiple_hits=False)
+    return np.asarray(found[0]), np.asarray(found[2])
 
 
 def seen_from(
@@ -68,9 +68,10 @@ def seen_from(
     """Whether surface points are the first thing on the line from `eye`."""
     ray = points - eye
     length = np.linalg.norm(ray, axis=1)
-    hits, index, _ = caster.intersects_location(
+    found = caster.intersects_location(
         np.tile(eye, (len(ray), 1)), ray / length[:, None], multiple_hits=False
     )
+    hits, index = np.asarray(found[0]), np.asarray(found[1])
     first = np.full(len(points), np.inf)
     first[index] = np.linalg.norm(hits - eye, axis=1)
     return np.abs(first - length) < 1e-3
@@ -85,8 +86,7 @@ def coverage(
     """
     mesh = trimesh.Trimesh(vertices, faces, process=False)
     caster = RayMeshIntersector(mesh)
-    points, _ = trimesh.sample.sample_surface(mesh, count, seed=int(rng.integers(2**31)))
-    points = np.asarray(points)
+    points = np.asarray(trimesh.sample.sample_surface(mesh, count, seed=int(rng.integers(2**31)))[0])
     by_views, by_any = np.zeros(count, bool), np.zeros(count, bool)
     for toward in view_directions():
         by_views |= seen_from(caster, DISTANCE * toward, points)

@@ -66,11 +66,12 @@ def twins_across_splits(
         if not len(a) or not len(b):
             continue
         index, difference = nearest_twins(fingerprints[a], fingerprints[b])
-        for k in np.flatnonzero(difference < threshold):
-            found[names[a[k]]] = Twin(
-                name=names[a[k]],
+        for k in np.flatnonzero(difference < threshold).tolist():
+            name = names[int(a[k])]
+            found[name] = Twin(
+                name=name,
                 split=leaving,
-                of=names[b[index[k]]],
+                of=names[int(b[index[k]])],
                 of_split=staying,
                 distance=float(difference[k]),
             )

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from more2_jax.data.formats.registry import FORMATS, WITH_DEPTH_FRAMES
 from more2_jax.data.labelled import LabelledCloud, ReadOptions, one_line
@@ -132,10 +132,10 @@ def _scan(path: Path, cloud: LabelledCloud, unit: str, min_points: int) -> Scan:
         )
     _check_points(path, cloud.points)
     points = cloud.points * UNITS_M[unit]
-    kept, skipped = _instances(cloud, points, min_points)
-    if not kept:
-        raise ValueError(f"{path}: no instances left; {_why_none(cloud, skipped, min_points)}")
     background = points[cloud.instance <= 0]
+    kept, skipped = _instances(cloud, cloud.instance, points, min_points)
+    if not kept:
+        raise ValueError(f"{path}: no instances left; {_why_none(len(background), skipped, min_points)}")
     return Scan(
         name=path.stem if path.is_file() else path.resolve().name,
         source=str(path),
@@ -147,11 +147,11 @@ def _scan(path: Path, cloud: LabelledCloud, unit: str, min_points: int) -> Scan:
 
 
 def _instances(
-    cloud: LabelledCloud, points: Float[np.ndarray, "n 3"], min_points: int
+    cloud: LabelledCloud, instance: Int[np.ndarray, " n"], points: Float[np.ndarray, "n 3"], min_points: int
 ) -> tuple[tuple[Instance, ...], tuple[Skipped, ...]]:
     """Splits the points by instance in one sort; ids ascend, points keep the file's order."""
-    order = np.argsort(cloud.instance, kind="stable")
-    ids, starts = np.unique(cloud.instance[order], return_index=True)
+    order = np.argsort(instance, kind="stable")
+    ids, starts = np.unique(instance[order], return_index=True)
     kept: list[Instance] = []
     skipped: list[Skipped] = []
     for index, rows in zip(ids.tolist(), np.split(order, starts[1:]), strict=True):
@@ -176,8 +176,7 @@ def _label(cloud: LabelledCloud, index: int, rows: np.ndarray) -> str | None:
     return text or None
 
 
-def _why_none(cloud: LabelledCloud, skipped: tuple[Skipped, ...], min_points: int) -> str:
-    background = int((cloud.instance <= 0).sum())
+def _why_none(background: int, skipped: tuple[Skipped, ...], min_points: int) -> str:
     if not skipped:
         return f"all {background} points are background (instance ≤ 0)"
     return f"{len(skipped)} had fewer than {min_points} points; {background} points are background"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import cast
 
@@ -39,8 +40,8 @@ def read_shapenet(folder: Path, report: Report | None = None) -> Iterator[Source
     for synset, category in SYNSETS.items():
         for model in sorted(p for p in (folder / synset).glob("*") if p.is_dir()):
             name = f"{synset}/{model.name}"
-            split = splits.get((synset, model.name))
-            yield from attempt(lambda: _read_model(model, name, category, split), name, report)  # noqa: B023
+            split: Split | None = splits.get((synset, model.name))
+            yield from attempt(partial(_read_model, model, name, category, split), name, report)
 
 
 def _read_model(model: Path, name: str, category: str, split: Split | None) -> SourceMesh:

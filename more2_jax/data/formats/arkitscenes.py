@@ -35,7 +35,7 @@ class Box:
     def inside(self, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, "n"]:
         """Which points lie in the box or on its sides."""
         along = (points - self.center) @ self.axes.T
-        return (np.abs(along) <= self.lengths / 2).all(axis=1)
+        return np.asarray((np.abs(along) <= self.lengths / 2).all(axis=1))
 
 
 def recognises(path: Path) -> bool:

@@ -27,7 +27,7 @@ def recognises(path: Path) -> bool:
 def read(path: Path, options: ReadOptions) -> LabelledCloud:
     """Every scan of the file, moved by its pose, in the file's order. The format has no instances, only metres."""
     try:
-        from pye57 import libe57
+        from pye57 import libe57  # pyright: ignore[reportAttributeAccessIssue]
     except ImportError as error:
         raise ValueError(f"{path}: needs the extra formats: pip install 'more2-jax[formats]'") from error
     try:

@@ -51,7 +51,7 @@ def _columns(path: Path, asked: str | None) -> tuple[dict[str, np.ndarray], list
         raise ValueError(f"{path}: needs the extra formats: pip install 'more2-jax[formats]'") from error
     try:
         _check_header(path)
-        with laspy.open(path, read_evlrs=False, laz_backend=laspy.LazBackend.Lazrs) as reader:
+        with laspy.open(path, read_evlrs=False, laz_backend=laspy.LazBackend.Lazrs) as reader:  # pyright: ignore[reportCallIssue, reportArgumentType]
             integers = _integers(reader.header.point_format)
             extra = set(reader.header.point_format.extra_dimension_names)
             has = set(reader.header.point_format.dimension_names)
