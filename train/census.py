@@ -7,6 +7,7 @@ respects; checks that every solid is closed and that signs agree with winding nu
 from __future__ import annotations
 
 import json
+import re
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
@@ -101,7 +102,9 @@ def reasons(folder: Path) -> list[str]:
     """Why meshes were left out of a folder, numbers taken out so that like reasons count together."""
     report = json.loads((folder / "report.json").read_text())
     given = [*report["rejected"].values(), *report.get("unreadable", {}).values()]
-    return [reason.split(";")[0].split("(")[0].split(":")[0].strip(" 0123456789.") for reason in given]
+    return [
+        re.sub(r"[\d.]+", "…", reason.split(";")[0].split("(")[0].split(":")[0]).strip() for reason in given
+    ]
 
 
 def census(
