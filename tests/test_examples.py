@@ -9,7 +9,7 @@ import subprocess
 import sys
 
 import pytest
-from conftest import ROOT
+from places import ROOT
 
 EXAMPLES = sorted((ROOT / "examples").glob("[0-9]*.py"))
 LIMIT_S = 300  # a minute on two quiet cores; machines are not always quiet
@@ -78,7 +78,7 @@ def test_the_gradient_agrees_with_finite_differences(printed):
 
 @pytest.mark.slow
 def test_a_hundred_pairs_are_registered(printed):
-    assert number_after("share below 5°:", printed(4)) > 0.8
+    assert number_after("share below 5°:", printed(4)) > 0.7
 
 
 @pytest.mark.slow
