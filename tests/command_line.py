@@ -1,5 +1,6 @@
 """Scan files, quick settings and refusals for tests of the command line."""
 
+import signal
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -49,3 +50,8 @@ def refused(capsys, *argv: object) -> str:
     assert len(lines) == 1
     assert lines[0].startswith("error: ")
     return lines[0]
+
+
+def heed_interrupts() -> None:
+    """For new processes: SIGINT stops them even where the tests run in the background, which ignores it."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)

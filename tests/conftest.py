@@ -1,7 +1,6 @@
 """JAX on the CPU in full precision, shapes of every signature checked, and the smallest prior there is."""
 
 import os
-from pathlib import Path
 
 os.environ["JAX_PLATFORMS"] = "cpu"
 
@@ -9,6 +8,7 @@ import jax
 import jaxtyping
 import pytest
 from jaxtyping import install_import_hook
+from places import ROOT
 
 # Before anything of more2_jax is imported: every call's shapes and dtypes are held against its annotations. Not in
 # `types`, whose records pass through JAX's transformations, nor where values of any kind are taken and refused.
@@ -18,8 +18,6 @@ CHECKED = (
 )
 install_import_hook([f"more2_jax.{name}" for name in CHECKED.split()], "beartype.beartype")
 jax.config.update("jax_default_matmul_precision", "highest")
-
-ROOT = Path(__file__).parents[1]
 
 
 @pytest.fixture(scope="session")

@@ -6,7 +6,7 @@ import re
 
 import numpy as np
 import pytest
-from conftest import ROOT
+from places import ROOT
 
 
 def snippet(page: str) -> str:

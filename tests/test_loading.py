@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import ROOT
+from places import ROOT
 
 from more2_jax.config import TrainingConfig
 from more2_jax.data.loading import step_key, training_records, training_samples

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import ROOT
+from places import ROOT
 
 from more2_jax.config import TrainingRun, load_config, to_yaml
 from more2_jax.data.sampling import sample_batch

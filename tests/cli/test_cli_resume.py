@@ -9,7 +9,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from command_line import QUICK, boxes, refused, run_quickly, scan_file
+from command_line import QUICK, boxes, heed_interrupts, refused, run_quickly, scan_file
 
 from more2_jax.cli import main
 from more2_jax.commands import building
@@ -60,6 +60,7 @@ def stopped(argv: list[str], place: str, nth: int, sent: signal.Signals) -> tupl
         stderr=subprocess.PIPE,
         text=True,
         env=os.environ | {"JAX_DEFAULT_MATMUL_PRECISION": "highest"},
+        preexec_fn=heed_interrupts,
     )
     with process:
         assert process.stdout is not None

@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from command_line import boxes, run_quickly, scan_file
+from command_line import boxes, heed_interrupts, run_quickly, scan_file
 from factories import living_scene
 from rich.table import Table
 
@@ -96,7 +96,9 @@ def test_sigint_to_the_process_exits_with_130(tmp_path, tiny):
         "sys.exit(main(sys.argv[1:]))"
     )
     argv = [sys.executable, "-c", code, "run", "a.ply", "--out", str(tmp_path / "room"), "--prior", str(tiny)]
-    with subprocess.Popen(argv, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+    with subprocess.Popen(
+        argv, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, preexec_fn=heed_interrupts
+    ) as process:
         assert process.stdout is not None
         assert process.stdout.readline() == "waiting\n"
         process.send_signal(signal.SIGINT)
