@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -27,10 +27,19 @@ class SegmentationConfig:
     planes: int = 12  # looked at, whether removed or not
     structure_area_m2: float = 0.6  # smaller planes are parts of objects
     behind_share: float = 0.04  # of the scene may lie beyond a floor or wall
-    link_m: float = 0.06  # voxels this near touch
-    core_neighbours: int = 7  # fewer within link_m: a voxel joins no two parts
-    smallest_points: int = 200
-    smallest_extent_m: float = 0.15  # longest side of the box about a cluster
+    structure_share: float = 0.35  # of the scene's extent that a floor or wall spans at least
+    room_m: float = 1.8  # floor and ceiling, or two facing walls, are this far apart: a table top is neither
+    link_m: float = 0.06  # voxels this near touch where points are dense
+    dense_points: float = 3.0  # a voxel, on average among neighbours
+    link_spacing: float = 2.0  # where points are sparse: times the distance of the last core neighbour
+    largest_link_m: float = 0.2
+    core_neighbours: int = 9  # fewer within reach: a voxel joins no two parts
+    join_area_m2: float = 0.1  # a smaller cluster is a piece of a neighbour
+    join_m: float = 0.15  # if one is this near
+    flat_m: float = 0.15  # a cluster that lies this close to a floor or wall is a part of it
+    flat_share: float = 0.9  # with this share of its voxels
+    smallest_area_m2: float = 0.03  # of its voxels
+    smallest_extent_m: float = 0.2
     seed: int = 0
 
 
@@ -59,15 +68,17 @@ class Segmentation:
         kept = [_words(p) for p in self.planes if not p.structure]
         said = [f"removed as floor or wall: {'; '.join(removed) or 'no plane'}"]
         if kept:
-            said.append(f"large planes kept, for part of the scene lies behind them: {'; '.join(kept)}")
+            said.append(f"large planes kept as parts of objects: {'; '.join(kept)}")
         return tuple(said)
 
 
 def segment_geometric(points: Float[np.ndarray, "n 3"], config: SegmentationConfig) -> Segmentation:
     """Cuts a cloud (metres, any frame) into floor, walls and clusters; the seed decides alone.
 
-    A plane is floor, wall or ceiling if it is large and nearly nothing lies beyond it: no direction is taken
-    for up, so a table top over a floor stays. Raises ValueError for a cloud too wide for the voxel grid.
+    A plane is floor, wall or ceiling if it is large, spans much of the scene, has nearly nothing beyond it, and
+    is not just over or before another: no direction is taken for up, and a table top over a floor stays. How far
+    apart two voxels of one part may be grows where points are sparse, as far from a camera.
+    Raises ValueError for a cloud too wide for the voxel grid.
     """
     if not len(points):
         return Segmentation(instance=np.zeros(0, np.int64), planes=(), skipped=())
@@ -75,8 +86,9 @@ def segment_geometric(points: Float[np.ndarray, "n 3"], config: SegmentationConf
     normals = _normals(voxels, config.normal_neighbours)
     planes, structure = _planes(voxels, normals, config)
     cluster = np.full(len(voxels), -1)
-    cluster[~structure] = _clusters(voxels[~structure], config)
-    instance, skipped = _large_clusters(points, cluster[voxel_of], config)
+    cluster[~structure] = _clusters(voxels[~structure], np.bincount(voxel_of)[~structure], config)
+    cluster = _without_flat(voxels, _joined(voxels, cluster, config), planes, config)
+    instance, skipped = _numbered(voxels, cluster, voxel_of, config)
     return Segmentation(instance=instance, planes=planes, skipped=skipped)
 
 
@@ -103,6 +115,14 @@ def _normals(voxels: Float[np.ndarray, "v 3"], neighbours: int) -> Float[np.ndar
     return np.linalg.eigh(np.einsum("vki,vkj->vij", centred, centred))[1][:, :, 0]
 
 
+def _extent(points: Float[np.ndarray, "n 3"]) -> float:
+    """Length along the direction of greatest spread, in any frame the same."""
+    if not len(points):
+        return 0.0
+    centred = points - points.mean(axis=0)
+    return float(np.ptp(centred @ np.linalg.eigh(centred.T @ centred)[1][:, -1]))
+
+
 # --- planes -------------------------------------------------------------------------------------------------
 
 
@@ -114,6 +134,7 @@ def _planes(
     free = np.ones(len(voxels), bool)  # not yet on any plane
     structure = np.zeros(len(voxels), bool)
     planes: list[Plane] = []
+    scene_m = _extent(voxels)
     for _ in range(config.planes):
         if (found := _largest_plane(voxels, normals, free, config, rng)) is None:
             break
@@ -127,20 +148,30 @@ def _planes(
             [(height < -config.plane_distance_m).mean(), (height > config.plane_distance_m).mean()]
         )
         sign = -1.0 if sides[0] > sides[1] else 1.0
-        is_structure = bool(sides.min() <= config.behind_share)
-        if is_structure:
+        plane = Plane(
+            normal=sign * normal,
+            offset_m=sign * offset,
+            area_m2=area,
+            behind=float(sides.min()),
+            structure=False,
+        )
+        wide = _extent(voxels[on]) >= config.structure_share * scene_m
+        if wide and plane.behind <= config.behind_share and not _before_another(plane, planes, config):
+            plane = replace(plane, structure=True)
             structure |= on | (sign * height < -config.plane_distance_m)
         free &= ~on
-        planes.append(
-            Plane(
-                normal=sign * normal,
-                offset_m=sign * offset,
-                area_m2=area,
-                behind=float(sides.min()),
-                structure=is_structure,
-            )
-        )
+        planes.append(plane)
     return tuple(planes), structure
+
+
+def _before_another(plane: Plane, planes: list[Plane], config: SegmentationConfig) -> bool:
+    """Whether it faces a floor or wall from nearer than a room is wide: a table top, a cabinet's door."""
+    return any(
+        p.structure
+        and p.normal @ plane.normal < -np.cos(np.deg2rad(config.plane_angle_deg))
+        and -plane.offset_m - p.offset_m < config.room_m
+        for p in planes
+    )
 
 
 def _largest_plane(
@@ -187,42 +218,88 @@ def _words(plane: Plane) -> str:
 # --- clusters -----------------------------------------------------------------------------------------------
 
 
-def _clusters(voxels: Float[np.ndarray, "v 3"], config: SegmentationConfig) -> Int[np.ndarray, "v"]:
-    """DBSCAN: parts that well-surrounded voxels connect; -1 for voxels near none of those."""
+def _clusters(
+    voxels: Float[np.ndarray, "v 3"], counts: Int[np.ndarray, "v"], config: SegmentationConfig
+) -> Int[np.ndarray, "v"]:
+    """DBSCAN whose radius follows the spacing of the points (`counts` a voxel); -1 for noise."""
     cluster = np.full(len(voxels), -1)
-    if not len(voxels):
+    k = min(config.normal_neighbours, len(voxels) - 1)
+    if k < config.core_neighbours:
         return cluster
-    pairs = cKDTree(voxels).query_pairs(config.link_m, output_type="ndarray")
-    core = np.bincount(pairs.ravel(), minlength=len(voxels)) >= config.core_neighbours
+    distance, near = (found[:, 1:] for found in cKDTree(voxels).query(voxels, k=k + 1))
+    last = distance[:, config.core_neighbours - 1]
+    dense = counts[near[:, : config.core_neighbours]].mean(axis=1) >= config.dense_points
+    sparse_reach = np.clip(config.link_spacing * last, config.link_m, config.largest_link_m)
+    reach = np.where(dense, config.link_m, sparse_reach)
+    core = last <= reach
     if not core.any():
         return cluster
-    a, b = pairs[core[pairs].all(axis=1)].T
-    graph = coo_matrix((np.ones(len(a), bool), (a, b)), shape=(len(voxels), len(voxels)))
+    # The lesser reach of two decides: stray points between two objects reach far, the objects do not.
+    linked = (distance <= np.minimum(reach[:, None], reach[near])) & core[near] & core[:, None]
+    a, slot = np.nonzero(linked)
+    graph = coo_matrix((np.ones(len(a), bool), (a, near[a, slot])), shape=(len(voxels), len(voxels)))
     cluster[core] = connected_components(graph, directed=False)[1][core]
     rest = np.flatnonzero(~core)
-    distance, nearest = cKDTree(voxels[core]).query(voxels[rest], distance_upper_bound=config.link_m)
-    reached = np.isfinite(distance)
+    gap, nearest = cKDTree(voxels[core]).query(voxels[rest], distance_upper_bound=config.link_m)
+    reached = np.isfinite(gap)
     cluster[rest[reached]] = cluster[core][nearest[reached]]
     return cluster
 
 
-def _large_clusters(
-    points: Float[np.ndarray, "n 3"], cluster: Int[np.ndarray, "n"], config: SegmentationConfig
+def _joined(
+    voxels: Float[np.ndarray, "v 3"], cluster: Int[np.ndarray, "v"], config: SegmentationConfig
+) -> Int[np.ndarray, "v"]:
+    """Pieces given to the nearest other cluster, the smallest first: a leg to its table."""
+    cluster = cluster.copy()
+    ids, counts = np.unique(cluster[cluster >= 0], return_counts=True)
+    small = counts * config.voxel_m**2 < config.join_area_m2
+    for piece in ids[small][np.argsort(counts[small], kind="stable")]:
+        rows, others = cluster == piece, (cluster >= 0) & (cluster != piece)
+        if not others.any():
+            continue
+        gap, nearest = cKDTree(voxels[others]).query(voxels[rows], distance_upper_bound=config.join_m)
+        if np.isfinite(gap).any():
+            cluster[rows] = cluster[others][nearest[np.argmin(gap)]]
+    return cluster
+
+
+def _without_flat(
+    voxels: Float[np.ndarray, "v 3"],
+    cluster: Int[np.ndarray, "v"],
+    planes: tuple[Plane, ...],
+    config: SegmentationConfig,
+) -> Int[np.ndarray, "v"]:
+    """Without patches of floors and walls: sensors warp a wall at the border of their view."""
+    cluster = cluster.copy()
+    for plane in planes:
+        if plane.structure:
+            clustered = cluster >= 0
+            total = np.bincount(cluster[clustered], minlength=1)
+            near = clustered & (np.abs(voxels @ plane.normal - plane.offset_m) < config.flat_m)
+            flat = np.bincount(cluster[near], minlength=len(total)) > config.flat_share * total
+            cluster[clustered & flat[cluster]] = -1
+    return cluster
+
+
+def _numbered(
+    voxels: Float[np.ndarray, "v 3"],
+    cluster: Int[np.ndarray, "v"],
+    voxel_of: Int[np.ndarray, "n"],
+    config: SegmentationConfig,
 ) -> tuple[Int[np.ndarray, "n"], tuple[Skipped, ...]]:
-    """Clusters large enough to be objects, numbered from 1 by their points; the others in one line."""
-    order = np.argsort(cluster, kind="stable")
-    ids, starts = np.unique(cluster[order], return_index=True)
-    groups = [rows for i, rows in zip(ids, np.split(order, starts[1:]), strict=True) if i >= 0]
-    large = [
-        rows
-        for rows in groups
-        if len(rows) >= config.smallest_points
-        and np.ptp(points[rows], axis=0).max() >= config.smallest_extent_m
-    ]
-    instance = np.zeros(len(points), np.int64)
-    for number, rows in enumerate(sorted(large, key=len, reverse=True), 1):
-        instance[rows] = number
-    if not (small := len(groups) - len(large)):
-        return instance, ()
-    reason = f"fewer than {config.smallest_points} points or smaller than {config.smallest_extent_m:g} m"
-    return instance, (Skipped(what=f"{small} small clusters", reason=reason),)
+    """Instance of every point: clusters large enough to be objects, from 1 by their points; the rest told."""
+    ids = np.unique(cluster[cluster >= 0])
+    points = np.bincount(cluster[voxel_of] + 1, minlength=ids.max(initial=0) + 2)[1:]
+    large = [i for i in ids if _is_large(voxels[cluster == i], config)]
+    number = np.zeros(len(points) + 1, np.int64)  # the last is that of -1: background
+    for k, i in enumerate(sorted(large, key=lambda i: -points[i]), 1):
+        number[i] = k
+    if not (small := len(ids) - len(large)):
+        return number[cluster][voxel_of], ()
+    reason = f"less than {config.smallest_area_m2:g} m² or shorter than {config.smallest_extent_m:g} m"
+    return number[cluster][voxel_of], (Skipped(what=f"{small} small clusters", reason=reason),)
+
+
+def _is_large(voxels: Float[np.ndarray, "v 3"], config: SegmentationConfig) -> bool:
+    area = len(voxels) * config.voxel_m**2
+    return area >= config.smallest_area_m2 and _extent(voxels) >= config.smallest_extent_m
