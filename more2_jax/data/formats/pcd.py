@@ -71,7 +71,7 @@ def read(path: Path, options: ReadOptions) -> LabelledCloud:
         colors=None if colors is None else colors[valid],
         point_labels=labels[valid] if labels is not None and labels.dtype.kind in "iu" else None,
         warnings=_warnings(header, int((~valid).sum())),
-        rows=valid,
+        rows=np.asarray(valid),
     )
 
 
