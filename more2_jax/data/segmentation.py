@@ -226,7 +226,7 @@ def _clusters(
     k = min(config.normal_neighbours, len(voxels) - 1)
     if k < config.core_neighbours:
         return cluster
-    distance, near = (found[:, 1:] for found in KDTree(voxels).query(voxels, k=k + 1))
+    distance, near = (np.asarray(found)[:, 1:] for found in KDTree(voxels).query(voxels, k=k + 1))
     last = distance[:, config.core_neighbours - 1]
     dense = counts[near[:, : config.core_neighbours]].mean(axis=1) >= config.dense_points
     sparse_reach = np.clip(config.link_spacing * last, config.link_m, config.largest_link_m)
@@ -240,7 +240,9 @@ def _clusters(
     graph = coo_matrix((np.ones(len(a), bool), (a, near[a, slot])), shape=(len(voxels), len(voxels)))
     cluster[core] = connected_components(graph, directed=False)[1][core]
     rest = np.flatnonzero(~core)
-    gap, nearest = KDTree(voxels[core]).query(voxels[rest], distance_upper_bound=config.link_m)
+    gap, nearest = map(
+        np.asarray, KDTree(voxels[core]).query(voxels[rest], distance_upper_bound=config.link_m)
+    )
     reached = np.isfinite(gap)
     cluster[rest[reached]] = cluster[core][nearest[reached]]
     return cluster
@@ -257,7 +259,9 @@ def _joined(
         rows, others = cluster == piece, (cluster >= 0) & (cluster != piece)
         if not others.any():
             continue
-        gap, nearest = KDTree(voxels[others]).query(voxels[rows], distance_upper_bound=config.join_m)
+        gap, nearest = map(
+            np.asarray, KDTree(voxels[others]).query(voxels[rows], distance_upper_bound=config.join_m)
+        )
         if np.isfinite(gap).any():
             cluster[rows] = cluster[others][nearest[np.argmin(gap)]]
     return cluster
