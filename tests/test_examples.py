@@ -57,7 +57,6 @@ def test_the_short_scene_has_at_most_15_lines_of_code():
     assert len([line for line in code.splitlines() if line.strip()]) <= 15
 
 
-@pytest.mark.slow
 def test_a_chair_is_found_again(printed):
     text = printed(1)
     assert number_after("rotation error:", text) < 2
@@ -81,7 +80,6 @@ def test_a_hundred_pairs_are_registered(printed):
     assert number_after("share below 5°:", printed(4)) > 0.7
 
 
-@pytest.mark.slow
 def test_a_mesh_from_one_view_is_closed_and_its_verdict_follows_from_its_figures(printed):
     text = printed(5)
     by_view = number_after("unseen surface to the nearest seen point:", text)
