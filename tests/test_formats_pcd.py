@@ -31,6 +31,7 @@ def test_reads_back(tmp_path: Path, data: str, packed: type):
     cloud = pcd.read(write_pcd(tmp_path / "a.pcd", wrote | {"rgb": bits.view(packed)}, data), OPTIONS)
     np.testing.assert_array_equal(cloud.points, np.stack([wrote[a] for a in "xyz"], axis=-1))
     np.testing.assert_array_equal(cloud.instance, wrote["label"])
+    assert cloud.colors is not None
     np.testing.assert_array_equal(cloud.colors @ [1 << 16, 1 << 8, 1], bits)
     assert cloud.warnings == ()
 
