@@ -1,0 +1,186 @@
+"""Who is who between scans: instance and scene recall (METHOD 3 and 9).
+
+`python -m eval.matching --data data/flying_sparse --out runs/matching --scenes 10`
+
+Pairs of the first scan with every later one, as the paper has them.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Mapping, Sequence
+from typing import Annotated
+
+import numpy as np
+import tyro
+
+from eval.batched import embed_all
+from eval.figures import Figure, Record
+from eval.match_scores import match_scores, partners
+from eval.options import Options, benchmark, is_upright
+from eval.peers.matching import Matcher, matchers
+from eval.results import finish
+from eval.runs import run_scenes, start_run
+from eval.truth import KnownScene
+from more2_jax.config import MatchingConfig, SceneConfig, preset
+from more2_jax.objects import new_object
+from more2_jax.prior import Prior, load_prior
+from more2_jax.tracking import match_scan
+from more2_jax.types import Embedding, Instance
+from train.program import run
+
+SHARES = (25, 50, 75, 100)  # %: of a scan pair's objects, for scene recall
+
+FIGURES = [
+    *(
+        Figure(
+            name="instance recall",
+            key=f"right.{column}",
+            statistic="ratio",
+            over="pairs",
+            column=column,
+            unit="%",
+            scale=100,
+        )
+        for column in ("paper", "published", "strict")
+    ),
+    *(
+        Figure(
+            name=f"scene recall ≥ {share} %",
+            key=f"recall.{column}",
+            statistic="at_least",
+            limit=share / 100 - 1e-9,
+            column=column,
+            unit="%",
+            scale=100,
+        )
+        for share in SHARES
+        for column in ("paper", "published", "strict")
+    ),
+    Figure(name="F1 of matches", key="f1.strict", statistic="mean", column="strict", unit="%", scale=100),
+    Figure(
+        name="instance recall, unmoved",
+        key="static.right",
+        statistic="ratio",
+        over="static.pairs",
+        unit="%",
+        scale=100,
+    ),
+    Figure(
+        name="instance recall, moved",
+        key="dynamic.right",
+        statistic="ratio",
+        over="dynamic.pairs",
+        unit="%",
+        scale=100,
+    ),
+    Figure(name="time a scan pair", key="seconds", statistic="mean", unit="s", better="lower"),
+]
+
+
+def main(options: Annotated[Options, tyro.conf.arg(name="")]) -> None:
+    """Instance and scene recall of the method, of its parts, and of what one would use instead."""
+    methods = own_settings(options.preset)
+    upright = is_upright(options, benchmark(options))
+    peers = matchers(upright) if options.peers else {}
+    current = start_run("matching", options, {"methods": [*methods, *peers]})
+    prior = load_prior(options.prior)
+    settings = {
+        n: dataclasses.replace(preset(options.preset, upright=upright), matching=m)
+        for n, m in methods.items()
+    }
+    records = run_scenes(current, options, lambda scenes: work(scenes, prior, settings, peers, options.batch))
+    finish(current, options, FIGURES, records, ("to_scan",))
+
+
+def own_settings(name: str) -> dict[str, MatchingConfig]:
+    """The preset's own matching, and the embeddings alone: Λ, 1/E, Λ ⊘ E, and Λ as the published code assigns."""
+    plain = MatchingConfig()
+    return {
+        f"ours, {name}": preset(name).matching,
+        "Λ ⊘ E": plain,
+        "Λ": dataclasses.replace(plain, score="inv"),
+        "1 / E": dataclasses.replace(plain, score="eqv"),
+        "Λ, greedy": dataclasses.replace(plain, score="inv", assignment="greedy"),
+    }
+
+
+def work(
+    scenes: Sequence[KnownScene],
+    prior: Prior,
+    settings: Mapping[str, SceneConfig],
+    peers: Mapping[str, Matcher],
+    batch: int,
+) -> list[list[Record]]:
+    """Records of some scenes, encoded together: one a scan pair and method."""
+    clouds = [i.points for s in scenes for scan in s.scans for i in scan.instances]
+    began = time.perf_counter()
+    codes = embed_all(prior, clouds, batch)
+    encoding_s = (time.perf_counter() - began) / max(1, len(clouds))
+    found, used = [], 0
+    for scene in scenes:
+        counts = [len(scan.instances) for scan in scene.scans]
+        parts = np.split(np.arange(used, used + sum(counts)), np.cumsum(counts)[:-1])
+        used += sum(counts)
+        found.append(
+            _scene_records(scene, [[codes[k] for k in p] for p in parts], encoding_s, settings, peers)
+        )
+    return found
+
+
+def _scene_records(
+    scene: KnownScene,
+    codes: Sequence[Sequence[Embedding]],
+    encoding_s: float,
+    settings: Mapping[str, SceneConfig],
+    peers: Mapping[str, Matcher],
+) -> list[Record]:
+    records: list[Record] = []
+    for b in range(1, len(scene.scans)):
+        one, other = scene.scans[0].instances, scene.scans[b].instances
+        if not partners(scene, 0, b):
+            continue
+        for name, config in settings.items():
+            began = time.perf_counter()
+            matched = match_own(one, codes[0], other, codes[b], config)
+            seconds = time.perf_counter() - began + encoding_s * (len(one) + len(other))
+            records.append(record(scene, b, name, matched, seconds))
+        for name, matcher in peers.items():
+            began = time.perf_counter()
+            matched = matcher(one, other)
+            records.append(record(scene, b, name, matched, time.perf_counter() - began))
+    return records
+
+
+def match_own(
+    one: Sequence[Instance],
+    one_codes: Sequence[Embedding],
+    other: Sequence[Instance],
+    other_codes: Sequence[Embedding],
+    config: SceneConfig,
+) -> dict[int, int]:
+    """The package's own matching of two scans: instance → instance."""
+    if not one or not other:
+        return {}
+    objects = [new_object(k, 0, i, e) for k, (i, e) in enumerate(zip(one, one_codes, strict=True))]
+    return {one[k].id: other[i].id for k, i, _ in match_scan(objects, other, other_codes, config)}
+
+
+def record(scene: KnownScene, b: int, method: str, matched: dict[int, int], seconds: float) -> Record:
+    """One scan pair: counts, recalls of the pair, and the parts that moved and did not."""
+    scores = match_scores(scene, 0, b, matched)
+    recalls = {
+        f"recall.{c}": scores[f"right.{c}"] / scores["pairs"] for c in ("paper", "published", "strict")
+    }
+    counts: dict[str, int] = {}
+    for kind, moved in (("static", False), ("dynamic", True)):
+        own = [o for o in partners(scene, 0, b) if o.moved.get(b) is moved]
+        if own:
+            right = [matched.get(o.instance[0]) == o.instance[b] for o in own]
+            counts |= {f"{kind}.pairs": len(own), f"{kind}.right": sum(right)}
+    return {"method": method, "to_scan": b, "seconds": seconds, **scores, **recalls, **counts}
+
+
+if __name__ == "__main__":
+    run(main)

@@ -1,0 +1,67 @@
+"""What every program of this folder is told."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from eval.flyingshape import flyingshape
+from eval.threerscan import threerscan
+from eval.truth import Benchmark
+
+Masks = Literal["true", "merged", "split", "eroded", "wrong", "predicted"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options:
+    """Which data, which settings, and where results go."""
+
+    data: Path
+    """Folder of the data set."""
+    out: Path
+    """Folder of the results; a stopped run resumes there."""
+    dataset: Literal["flyingshape", "3rscan"] = "flyingshape"
+    """flyingshape: written by train.synthesise, or the published npz files."""
+    preset: Literal["paper", "robust"] = "robust"
+    """Settings of the method."""
+    prior: str = "small"
+    """Name of shipped weights, or a file."""
+    scenes: int = 0
+    """How many, from the first; 0 for all."""
+    masks: Masks = "true"
+    """true, damaged on purpose, or (3rscan) predicted: mask3d.labels.npz beside each scan."""
+    upright: Literal["auto", "yes", "no"] = "auto"
+    """Whether the method is told that objects only turn about the vertical; auto: as the data were made."""
+    peers: bool = True
+    """Also measure what one would use instead, on the same clouds."""
+    chunk: int = 4
+    """Scenes that share a batch."""
+    batch: int = 16
+    """Clouds or pairs a compiled call takes; shared by all devices."""
+    split: Literal["train", "validation", "test"] = "validation"
+    """Of 3rscan."""
+    distributed: bool = False
+    """Several hosts, each with its share of the scenes: jax.distributed, set up by the cluster."""
+
+
+def benchmark(o: Options) -> Benchmark:
+    """The data. Raises ValueError if there are none of that kind, or the masks are not to be had."""
+    if not o.data.is_dir():
+        raise ValueError(f"{o.data}: no such folder")
+    if o.scenes < 0 or o.chunk < 1 or o.batch < 1:
+        raise ValueError(
+            f"scenes {o.scenes}, chunk {o.chunk}, batch {o.batch}; needed 0 or more, and positive"
+        )
+    if o.dataset == "3rscan":
+        return threerscan(o.data, split=o.split, predicted=o.masks == "predicted")
+    if o.masks == "predicted":
+        raise ValueError(
+            "predicted masks are read for 3rscan only; damaged ones are merged, split, eroded, wrong"
+        )
+    return flyingshape(o.data)
+
+
+def is_upright(o: Options, data: Benchmark) -> bool:
+    """What the method is told."""
+    return data.upright if o.upright == "auto" else o.upright == "yes"

@@ -1,0 +1,60 @@
+"""What a run leaves behind: results.json, tables.md, tables.tex, and plots."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib.metadata
+import sys
+from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
+from typing import Any
+
+import jax
+from rich.console import Console
+
+from eval.figures import Figure, Record, Row, rows_of
+from eval.options import Options
+from eval.runs import Run, hardware, write_json
+from eval.tables import latex, markdown, on_screen
+
+
+def finish(
+    run: Run,
+    o: Options,
+    figures: Sequence[Figure],
+    records: Mapping[str, Sequence[Record]],
+    groups: Sequence[str] = (),
+) -> list[Row]:
+    """Writes and prints all figures of a run; only the first host does. Returns the rows."""
+    rows = rows_of(figures, records, groups)
+    if jax.process_index():
+        return rows
+    write_json(
+        run.out / "results.json", {**provenance(run, o), "rows": [dataclasses.asdict(r) for r in rows]}
+    )
+    title = f"{run.settings['program']}, {run.data.facts['dataset']}, {run.data.facts.get('regime')}"
+    (run.out / "tables.md").write_text(markdown(rows, title), encoding="utf-8")
+    (run.out / "tables.tex").write_text(latex(rows, title), encoding="utf-8")
+    console = Console()
+    console.print(on_screen([r for r in rows if r.group == "all"], title))
+    console.print(f"{len(records)} of {len(run.names)} scenes; tables in {run.out}", highlight=False)
+    return rows
+
+
+def provenance(run: Run, o: Options) -> dict[str, Any]:
+    """Command, data, settings, hardware, versions: what a figure belongs to."""
+    return {
+        "command": " ".join(["python", "-m", f"eval.{run.settings['program']}", *sys.argv[1:]]),
+        "date": datetime.now(UTC).isoformat(timespec="seconds"),
+        "hardware": hardware(),
+        "versions": {p: _version(p) for p in ("jax", "open3d-cpu", "small-gicp", "kiss-matcher")},
+        "scenes_asked": o.scenes or len(run.data.names),
+        "settings": run.settings,
+    }
+
+
+def _version(package: str) -> str | None:
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return None
