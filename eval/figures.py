@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
 
 Record = dict[str, Any]  # one pair, object or scan pair; None stands for a failure
 Column = Literal["paper", "published", "strict", ""]
+COLUMNS: tuple[Column, ...] = ("paper", "published", "strict")
 DRAWS = 500  # of the bootstrap
 
 
@@ -33,6 +34,11 @@ class Figure:
     scale: float = 1.0
     over: str = ""
     successes: tuple[str, float] | None = None  # only records whose value of this key is below
+
+
+def in_columns(figure: Figure) -> list[Figure]:
+    """The figure once for each column: its key with the column's name after a dot."""
+    return [replace(figure, key=f"{figure.key}.{c}", column=c) for c in COLUMNS]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -159,8 +165,3 @@ def _rows(
 ) -> list[Row]:
     rows = [figure_row(f, {s: r for s, r in records.items() if r}, method, group) for f in figures]
     return [r for r in rows if r is not None]
-
-
-def plain(row: Row) -> dict[str, Any]:
-    """A row for JSON."""
-    return asdict(row)

@@ -7,16 +7,16 @@ Pairs of the first scan with every later one, as the paper has them.
 
 from __future__ import annotations
 
-import dataclasses
 import time
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Annotated
 
 import numpy as np
 import tyro
 
 from eval.batched import embed_all
-from eval.figures import Figure, Record
+from eval.figures import COLUMNS, Figure, Record, in_columns
 from eval.match_scores import match_scores, partners
 from eval.options import Options, benchmark, is_upright
 from eval.peers.matching import Matcher, matchers
@@ -32,49 +32,26 @@ from train.program import run
 
 SHARES = (25, 50, 75, 100)  # %: of a scan pair's objects, for scene recall
 
+PERCENT = Figure(name="", key="", statistic="ratio", unit="%", scale=100)
+RECALL = replace(PERCENT, name="instance recall", key="right", over="pairs")
 FIGURES = [
+    *in_columns(RECALL),
     *(
-        Figure(
-            name="instance recall",
-            key=f"right.{column}",
-            statistic="ratio",
-            over="pairs",
-            column=column,
-            unit="%",
-            scale=100,
-        )
-        for column in ("paper", "published", "strict")
-    ),
-    *(
-        Figure(
-            name=f"scene recall ≥ {share} %",
-            key=f"recall.{column}",
-            statistic="at_least",
-            limit=share / 100 - 1e-9,
-            column=column,
-            unit="%",
-            scale=100,
-        )
+        f
         for share in SHARES
-        for column in ("paper", "published", "strict")
+        for f in in_columns(
+            replace(
+                PERCENT,
+                name=f"scene recall ≥ {share} %",
+                key="recall",
+                statistic="at_least",
+                limit=share / 100 - 1e-9,
+            )
+        )
     ),
-    Figure(name="F1 of matches", key="f1.strict", statistic="mean", column="strict", unit="%", scale=100),
-    Figure(
-        name="instance recall, unmoved",
-        key="static.right",
-        statistic="ratio",
-        over="static.pairs",
-        unit="%",
-        scale=100,
-    ),
-    Figure(
-        name="instance recall, moved",
-        key="dynamic.right",
-        statistic="ratio",
-        over="dynamic.pairs",
-        unit="%",
-        scale=100,
-    ),
+    replace(PERCENT, name="F1 of matches", key="f1.strict", statistic="mean", column="strict"),
+    replace(RECALL, name="instance recall, unmoved", key="static.right", over="static.pairs", column="paper"),
+    replace(RECALL, name="instance recall, moved", key="dynamic.right", over="dynamic.pairs", column="paper"),
     Figure(name="time a scan pair", key="seconds", statistic="mean", unit="s", better="lower"),
 ]
 
@@ -86,10 +63,7 @@ def main(options: Annotated[Options, tyro.conf.arg(name="")]) -> None:
     peers = matchers(upright) if options.peers else {}
     current = start_run("matching", options, {"methods": [*methods, *peers]})
     prior = load_prior(options.prior)
-    settings = {
-        n: dataclasses.replace(preset(options.preset, upright=upright), matching=m)
-        for n, m in methods.items()
-    }
+    settings = {n: replace(preset(options.preset, upright=upright), matching=m) for n, m in methods.items()}
     records = run_scenes(current, options, lambda scenes: work(scenes, prior, settings, peers, options.batch))
     finish(current, options, FIGURES, records, ("to_scan",))
 
@@ -100,9 +74,9 @@ def own_settings(name: str) -> dict[str, MatchingConfig]:
     return {
         f"ours, {name}": preset(name).matching,
         "Λ ⊘ E": plain,
-        "Λ": dataclasses.replace(plain, score="inv"),
-        "1 / E": dataclasses.replace(plain, score="eqv"),
-        "Λ, greedy": dataclasses.replace(plain, score="inv", assignment="greedy"),
+        "Λ": replace(plain, score="inv"),
+        "1 / E": replace(plain, score="eqv"),
+        "Λ, greedy": replace(plain, score="inv", assignment="greedy"),
     }
 
 
@@ -170,9 +144,7 @@ def match_own(
 def record(scene: KnownScene, b: int, method: str, matched: dict[int, int], seconds: float) -> Record:
     """One scan pair: counts, recalls of the pair, and the parts that moved and did not."""
     scores = match_scores(scene, 0, b, matched)
-    recalls = {
-        f"recall.{c}": scores[f"right.{c}"] / scores["pairs"] for c in ("paper", "published", "strict")
-    }
+    recalls = {f"recall.{c}": scores[f"right.{c}"] / scores["pairs"] for c in COLUMNS}
     counts: dict[str, int] = {}
     for kind, moved in (("static", False), ("dynamic", True)):
         own = [o for o in partners(scene, 0, b) if o.moved.get(b) is moved]

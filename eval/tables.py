@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
+from rich.box import SIMPLE
+from rich.markup import escape
 from rich.table import Table
 
 from eval.figures import Row
@@ -124,12 +126,12 @@ def latex(rows: Sequence[Row], title: str) -> str:
 def on_screen(rows: Sequence[Row], title: str) -> Table:
     """Values alone, for a terminal; intervals and failures stand in the files."""
     headings, methods, found = layout(rows)
-    table = Table("figure", *methods, title=title)
+    table = Table("figure", *methods, title=title, box=SIMPLE)
     for name in headings:
         line = [found.get((name, m)) for m in methods]
         top = best(r for r in line if r is not None)
         shown = ["" if r is None else number(r.value) for r in line]
         table.add_row(
-            name, *(f"[bold]{t}[/]" if id(r) in top else t for t, r in zip(shown, line, strict=True))
+            escape(name), *(f"[bold]{t}[/]" if id(r) in top else t for t, r in zip(shown, line, strict=True))
         )
     return table

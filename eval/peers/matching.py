@@ -39,9 +39,8 @@ def d2(cloud: Points) -> Float[np.ndarray, "bins"]:
 
 def by_size(one: Sequence[Instance], other: Sequence[Instance]) -> Matched:
     """Hungarian on the difference of sorted extents."""
-    return assigned(
-        one, other, cdist(*(np.stack([sorted_extents(i.points) for i in s]) for s in (one, other)))
-    )
+    a, b = (np.stack([sorted_extents(i.points) for i in s]) for s in (one, other))
+    return assigned(one, other, cdist(a, b))
 
 
 def by_d2(one: Sequence[Instance], other: Sequence[Instance]) -> Matched:
@@ -63,20 +62,25 @@ def bag(feature: Float[np.ndarray, "n 33"], words: Float[np.ndarray, "w 33"]) ->
     return np.bincount(vq(feature, words)[0], minlength=len(words)) / max(1, len(feature))
 
 
-def by_registration(upright: bool) -> Matcher:
-    """Hungarian on what is left after registering every pair by multi-start GICP."""
+def by_registration(upright: bool, reject: float = np.inf) -> Matcher:
+    """Hungarian on what is left after registering every pair by multi-start GICP; none at `reject` or above."""
 
     def match(one: Sequence[Instance], other: Sequence[Instance]) -> Matched:
         clouds = [[i.points for i in s] for s in (one, other)]
-        return assigned(one, other, all_pairs(clouds[0], clouds[1], upright))
+        return assigned(one, other, all_pairs(clouds[0], clouds[1], upright), reject)
 
     return match
 
 
-def assigned(one: Sequence[Instance], other: Sequence[Instance], cost: Float[np.ndarray, "n m"]) -> Matched:
-    """The assignment with the least total cost."""
+def assigned(
+    one: Sequence[Instance],
+    other: Sequence[Instance],
+    cost: Float[np.ndarray, "n m"],
+    reject: float = np.inf,
+) -> Matched:
+    """The assignment with the least total cost; pairs that cost `reject` or more are none."""
     rows, columns = linear_sum_assignment(cost)
-    return {one[r].id: other[c].id for r, c in zip(rows, columns, strict=True)}
+    return {one[r].id: other[c].id for r, c in zip(rows, columns, strict=True) if cost[r, c] < reject}
 
 
 def matchers(upright: bool) -> dict[str, Matcher]:

@@ -1,0 +1,200 @@
+"""Which parts matter: embeddings of the matching, variables of the joint optimisation, the descent of registration.
+
+`python -m eval.ablations --data data/flying_sparse --out runs/ablations --scenes 4`
+
+Joint optimisation starts from the method's own poses of every scan onto the first, for true matches.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Annotated
+
+import numpy as np
+import tyro
+
+from eval.batched import PairToRegister, embed_all, register_all
+from eval.figures import Figure, Record, in_columns
+from eval.matching import RECALL, match_own
+from eval.matching import record as match_record
+from eval.mesh_scores import RECONSTRUCTED, mesh_scores
+from eval.options import Options, benchmark, is_upright
+from eval.pose_scores import pose_scores
+from eval.reconstruction import Seen, embedded, fitted_in_batches, seen_objects
+from eval.registration import own_records, own_settings, true_pairs
+from eval.results import finish
+from eval.runs import run_scenes, start_run
+from eval.truth import KnownScene
+from more2_jax.config import JointConfig, MatchingConfig, SceneConfig, preset
+from more2_jax.fitting import repose
+from more2_jax.prior import Prior, load_prior
+from more2_jax.scene import mesh_of
+from more2_jax.types import SceneObject
+from train.program import run
+
+RATES = {
+    "pose": "pose_learning_rate",
+    "inv": "inv_learning_rate",
+    "eqv": "eqv_learning_rate",
+    "center": "center_learning_rate",
+}
+FREED: dict[str, tuple[str, ...]] = {
+    "G": ("pose",),
+    "F_inv": ("inv",),
+    "F_inv, F_eqv, F_c": ("inv", "eqv", "center"),
+    "F_eqv, G": ("eqv", "pose"),
+    "F_inv, F_eqv, F_c, G": ("inv", "eqv", "center", "pose"),
+}
+SCORES = {"Λ": "inv", "1 / E": "eqv", "Λ ⊘ E": "both"}
+
+SHARE = Figure(name="", key="", statistic="share", unit="%", scale=100)
+ERROR = Figure(
+    name="MedRE", key="re_deg.strict", statistic="median", column="strict", unit="°", better="lower"
+)
+LENGTH = Figure(
+    name="Chamfer-L1",
+    key="chamfer_m.strict",
+    statistic="mean",
+    column="strict",
+    unit="cm",
+    scale=100,
+    better="lower",
+)
+FIGURES = [
+    *in_columns(RECALL),
+    replace(SHARE, name="RE < 5°", key="re_deg.strict", limit=5, column="strict"),
+    ERROR,
+    replace(ERROR, name="mean RE", statistic="mean"),
+    LENGTH,
+    replace(SHARE, name="IoU", key="iou.paper", statistic="mean", column="paper"),
+    replace(
+        SHARE,
+        name="SDF recall, objects",
+        key="recall.strict",
+        statistic="at_least",
+        limit=RECONSTRUCTED,
+        column="strict",
+    ),
+]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Settings(Options):
+    """Which data, which settings, and where results go."""
+
+    scans: int = 5
+    """Scans that the joint optimisation sees."""
+    samples: int = 20_000
+    """Points on each surface."""
+
+
+def main(options: Annotated[Settings, tyro.conf.arg(name="")]) -> None:
+    """One table a study; methods are named after the study and the setting."""
+    data = benchmark(options)
+    config, prior = preset(options.preset, upright=is_upright(options, data)), load_prior(options.prior)
+    current = start_run("ablations", options, {"scans": options.scans, "samples": options.samples})
+
+    def work(scenes: Sequence[KnownScene]) -> list[list[Record]]:
+        found = [*matching_study(scenes, prior, options), *registration_study(scenes, prior, config, options)]
+        found += joint_study(scenes, prior, config, options)
+        return [[r for n, r in found if n == s.name] for s in scenes]
+
+    records = run_scenes(current, options, work)
+    finish(current, options, FIGURES, records)
+
+
+def matching_study(scenes: Sequence[KnownScene], prior: Prior, o: Settings) -> list[tuple[str, Record]]:
+    """Λ, 1/E and Λ ⊘ E, assigned alike (paper's preset)."""
+    found = []
+    for scene in scenes:
+        counts = np.cumsum([len(s.instances) for s in scene.scans])
+        codes = embed_all(prior, [i.points for s in scene.scans for i in s.instances], o.batch)
+        by_scan = [codes[b - len(s.instances) : b] for b, s in zip(counts, scene.scans, strict=True)]
+        for name, score in SCORES.items():
+            config = SceneConfig(matching=MatchingConfig(score=score))  # pyright: ignore[reportArgumentType]
+            for b in range(1, len(scene.scans)):
+                one, other = scene.scans[0].instances, scene.scans[b].instances
+                matched = match_own(one, by_scan[0], other, by_scan[b], config)
+                found.append((scene.name, match_record(scene, b, f"matching by {name}", matched, 0.0)))
+    return found
+
+
+def registration_study(
+    scenes: Sequence[KnownScene], prior: Prior, config: SceneConfig, o: Settings
+) -> list[tuple[str, Record]]:
+    """With and without descent on the loss."""
+    pairs = [p for s in scenes for p in true_pairs(s)]
+    settings = {
+        n.replace(f"ours, {o.preset}", "registration"): c
+        for n, c in own_settings(o.preset, config.upright).items()
+    }
+    return own_records(pairs, prior, settings, config.upright, o.batch)
+
+
+def joint_study(
+    scenes: Sequence[KnownScene], prior: Prior, config: SceneConfig, o: Settings
+) -> list[tuple[str, Record]]:
+    """Nothing freed, and the five settings."""
+    seen = seen_objects(scenes, o.scans)
+    start = registered(prior, seen, embedded(prior, seen, o.batch), config, o.batch)
+    found = joint_records(seen, start, prior, config, "joint: nothing", o.samples)
+    for name, freed in FREED.items():
+        own = dataclasses.replace(config, joint=only(config.joint, freed))
+        fitted = fitted_in_batches(prior, start, own, o.batch)
+        found += joint_records(seen, fitted, prior, config, f"joint: {name}", o.samples)
+    return found
+
+
+def only(config: JointConfig, freed: Sequence[str]) -> JointConfig:
+    """The settings with a step size of zero for what is not freed."""
+    return replace(config, **{rate: 0.0 for name, rate in RATES.items() if name not in freed})
+
+
+def registered(
+    prior: Prior, seen: Sequence[Seen], objects: Sequence[SceneObject], config: SceneConfig, batch: int
+) -> list[SceneObject]:
+    """The objects with the method's own poses in place of the true ones, encoded anew."""
+    raw = [[s.scene.instance(o.scan, o.instance).points for o in s.observations] for s in seen]
+    codes = embed_all(prior, [c for clouds in raw for c in clouds], batch)
+    pairs, used = [], 0
+    for clouds in raw:
+        own = codes[used : used + len(clouds)]
+        pairs += [
+            PairToRegister(source=c, target=clouds[0], source_code=e, target_code=own[0])
+            for c, e in zip(clouds[1:], own[1:], strict=True)
+        ]
+        used += len(clouds)
+    poses = iter(register_all(prior, pairs, config.registration, config.upright, batch))
+    posed = [
+        repose(x, [np.eye(4), *(next(poses) for _ in clouds[1:])])
+        for x, clouds in zip(objects, raw, strict=True)
+    ]
+    again = embed_all(prior, [x.points for x in posed], batch)
+    return [dataclasses.replace(x, embedding=e) for x, e in zip(posed, again, strict=True)]
+
+
+def joint_records(
+    seen: Sequence[Seen],
+    objects: Sequence[SceneObject],
+    prior: Prior,
+    config: SceneConfig,
+    method: str,
+    samples: int,
+) -> list[tuple[str, Record]]:
+    """One record of each object's mesh, and one of each of its poses."""
+    found = []
+    for s, own in zip(seen, objects, strict=True):
+        scores = mesh_scores(mesh_of(prior, own, config), s.known, s.known.T_scan_model[0], samples)
+        found.append((s.scene.name, {"method": method, "object": s.known.name, **scores}))
+        target = s.scene.instance(0, s.known.instance[0]).points
+        for o in own.observations[1:]:
+            source = s.scene.instance(o.scan, o.instance).points
+            pose = pose_scores(o.T_ref_scan, s.known, s.known, o.scan, 0, source, target)
+            found.append((s.scene.name, {"method": method, "to_scan": o.scan, **pose}))
+    return found
+
+
+if __name__ == "__main__":
+    run(main)

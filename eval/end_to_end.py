@@ -1,0 +1,127 @@
+"""The whole task: matched, registered and reconstructed objects over all scans (MR and MRR, METHOD 9).
+
+`python -m eval.end_to_end --data data/flying_sparse --out runs/end_to_end --scenes 10`
+
+Scenes are spread over the devices of a host, one a device at a time, and over hosts.
+"""
+
+from __future__ import annotations
+
+import itertools
+import time
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from typing import Annotated, Any
+
+import jax
+import tyro
+
+from eval.figures import Figure, Record, in_columns
+from eval.options import Options, benchmark, is_upright
+from eval.peers.end_to_end import NAME, combined
+from eval.results import finish
+from eval.runs import run_scenes, start_run
+from eval.tracks import Track, changes_f1, score_tracks, tracks_of
+from eval.truth import KnownScene
+from more2_jax.config import SceneConfig, preset
+from more2_jax.prior import Prior, load_prior
+from more2_jax.scene import add_scan, reconstruct, start_scene
+from more2_jax.types import LivingScene
+from train.program import run
+
+
+@dataclass(frozen=True, kw_only=True)
+class Settings(Options):
+    """Which data, which settings, and where results go."""
+
+    samples: int = 20_000
+    """Points on each surface."""
+
+
+def figures() -> list[Figure]:
+    """MR, MRR and their parts."""
+    share = Figure(name="instance recall", key="m", statistic="at_least", limit=1, unit="%", scale=100)
+    error = Figure(name="MedRE of true pairs", key="re_deg.strict", statistic="median", unit="°")
+    return [
+        *in_columns(share),
+        *in_columns(replace(share, name="MR", key="mr")),
+        *in_columns(replace(share, name="MRR", key="mrr")),
+        replace(error, column="strict", better="lower"),
+        replace(share, name="added and removed, F1", key="changes_f1", statistic="mean"),
+        Figure(name="time a scene", key="seconds", statistic="mean", unit="s", better="lower"),
+    ]
+
+
+def main(options: Annotated[Settings, tyro.conf.arg(name="")]) -> None:
+    """MR and MRR of the method, and of the best of each other stage combined."""
+    data = benchmark(options)
+    upright = is_upright(options, data)
+    config, prior = preset(options.preset, upright=upright), load_prior(options.prior)
+    methods: dict[str, Callable[[KnownScene], list[Track]]] = {
+        f"ours, {options.preset}": lambda s: tracks_of(living_scene(s, prior, config))
+    }
+    if options.peers:
+        methods[NAME] = lambda s: combined(s.scans, upright)
+    stated = {"methods": list(methods), "samples": options.samples}
+    current = start_run("end_to_end", options, stated)
+
+    def one(scene: KnownScene) -> list[Record]:
+        return [
+            r for n, m in methods.items() for r in records_of(scene, n, m, data.right_deg, options.samples)
+        ]
+
+    records = run_scenes(current, options, lambda scenes: on_all_devices(one, scenes))
+    finish(current, options, figures(), records, ("to_scan", "category"))
+
+
+def on_all_devices(
+    one: Callable[[KnownScene], list[Record]], scenes: Sequence[KnownScene]
+) -> list[list[Record]]:
+    """A thread for each local device; each scene's programs run on the device of its thread."""
+    devices = jax.local_devices()
+    if len(devices) == 1:
+        return [one(s) for s in scenes]
+
+    def placed(scene: KnownScene, device: Any) -> list[Record]:
+        with jax.default_device(device):
+            return one(scene)
+
+    with ThreadPoolExecutor(len(devices)) as pool:
+        return list(pool.map(placed, scenes, itertools.cycle(devices)))
+
+
+def living_scene(scene: KnownScene, prior: Prior, config: SceneConfig) -> LivingScene:
+    """The method on all scans in turn, then meshes."""
+    *_, last = living_scenes(scene, prior, config)
+    return reconstruct(prior, last, config)
+
+
+def living_scenes(scene: KnownScene, prior: Prior, config: SceneConfig) -> Iterator[LivingScene]:
+    """The living scene after every scan, without meshes."""
+    found = start_scene(prior, scene.scans[0], config)
+    yield found
+    for scan in scene.scans[1:]:
+        found = add_scan(prior, found, scan, config)
+        yield found
+
+
+def records_of(
+    scene: KnownScene, name: str, method: Callable[[KnownScene], list[Track]], right_deg: float, samples: int
+) -> list[Record]:
+    """One record a true pair, and one of the scene. A method that cannot use a scan has failed on the scene."""
+    began = time.perf_counter()
+    try:
+        tracks = method(scene)
+    except ValueError as error:  # a scan without a usable instance
+        tracks, reason = [], str(error)
+    else:
+        reason = ""
+    seconds = time.perf_counter() - began
+    pairs = score_tracks(scene, tracks, right_deg, samples)
+    whole: Record = {"seconds": seconds, "changes_f1": changes_f1(scene, tracks), "reason": reason}
+    return [{"method": name, **r} for r in [*pairs, whole]]
+
+
+if __name__ == "__main__":
+    run(main)

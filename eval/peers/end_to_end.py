@@ -1,0 +1,52 @@
+"""The whole task without a learned prior: registration of all pairs to match, many starts of GICP, ball pivoting."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from eval.peers.matching import by_registration
+from eval.peers.reconstruction import ball_pivoting
+from eval.peers.registration import many_starts
+from eval.tracks import Track
+from more2_jax.metrics import apply_pose
+from more2_jax.types import Instance, Scan
+
+NAME = "all-pairs GICP + multi-start GICP + ball pivoting"
+REJECT = 0.05  # of the diagonal: clouds that stay this far apart show two objects
+FEWEST = 64  # points of an instance that is used at all
+
+
+def combined(scans: Sequence[Scan], upright: bool) -> list[Track]:
+    """Every scan in turn is matched to all objects known so far, each with all that was seen of it.
+
+    A pair that fits badly is not one object.
+    """
+    match = by_registration(upright, REJECT)
+    tracks: list[Track] = []
+    for k, scan in enumerate(scans):
+        new = [i for i in scan.instances if len(i.points) >= FEWEST]
+        old = [Instance(id=n, points=t.points) for n, t in enumerate(tracks)]
+        matched = match(old, new) if old and new else {}
+        by_id = {i.id: i for i in new}
+        for n, id_ in matched.items():
+            T = many_starts(by_id[id_].points, old[n].points, upright)
+            if T is not None:
+                tracks[n] = extended(tracks[n], k, by_id.pop(id_), T)
+        tracks += [begun(k, i) for i in by_id.values()]
+    return [Track(**{**vars(t), "mesh": ball_pivoting(t.points)}) for t in tracks]
+
+
+def begun(scan: int, i: Instance) -> Track:
+    """An object seen for the first time."""
+    return Track(instance={scan: i.id}, T_track_scan={scan: np.eye(4)}, points=i.points)
+
+
+def extended(t: Track, scan: int, i: Instance, T: np.ndarray) -> Track:
+    """The object with one more observation."""
+    return Track(
+        instance={**t.instance, scan: i.id},
+        T_track_scan={**t.T_track_scan, scan: T},
+        points=np.concatenate([t.points, apply_pose(T, i.points)]),
+    )

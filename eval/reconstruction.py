@@ -1,0 +1,200 @@
+"""How well objects are reconstructed: Chamfer, IoU, SDF recall, and what a user of meshes asks (METHOD 5, 6 and 9).
+
+`python -m eval.reconstruction --data data/flying_sparse --out runs/reconstruction --scenes 10 --scans 1`
+
+With `--scans k` the observations of the first k scans are accumulated under their true poses: poses are another
+program's business.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Annotated
+
+import numpy as np
+import tyro
+from jaxtyping import Float, Int
+
+from eval.batched import embed_all
+from eval.figures import Column, Figure, Record
+from eval.masks import LOST
+from eval.mesh_scores import RECONSTRUCTED, mesh_scores
+from eval.options import Options, benchmark, is_upright
+from eval.peers.reconstruction import SURFACERS, Surfacer
+from eval.results import finish
+from eval.runs import run_scenes, start_run
+from eval.truth import KnownObject, KnownScene
+from more2_jax.config import SceneConfig, preset
+from more2_jax.fitting import fit_objects
+from more2_jax.metrics import apply_pose
+from more2_jax.prior import Prior, load_prior
+from more2_jax.scene import mesh_of
+from more2_jax.types import Mesh, Observation, SceneObject
+from train.program import run
+
+
+@dataclass(frozen=True, kw_only=True)
+class Settings(Options):
+    """Which data, which settings, and where results go."""
+
+    scans: int = 1
+    """How many scans are accumulated, under their true poses."""
+    samples: int = 100_000
+    """Points on each surface, and in the box of the inside tests."""
+
+
+def _of(name: str, key: str, column: Column, **more: object) -> Figure:
+    return replace(Figure(name=name, key=key, statistic="mean", column=column), **more)  # pyright: ignore[reportArgumentType]
+
+
+PERCENT = {"unit": "%", "scale": 100.0}
+LENGTH = {"unit": "cm", "scale": 100.0, "better": "lower"}
+AT_LEAST = {"statistic": "at_least", "limit": RECONSTRUCTED, **PERCENT}
+
+FIGURES = [
+    _of("Chamfer-L1", "chamfer.paper", "paper", unit="10⁻³", scale=1000.0, better="lower"),
+    _of("Chamfer-L1", "chamfer.published", "published", unit="10⁻³", scale=1000.0, better="lower"),
+    _of("Chamfer-L1", "chamfer_m.strict", "strict", **LENGTH),
+    _of("Chamfer-L1, median", "chamfer_m.strict", "strict", **{**LENGTH, "statistic": "median"}),
+    _of("accuracy", "accuracy_m", "strict", **LENGTH),
+    _of("completeness", "completeness_m", "strict", **LENGTH),
+    _of("completeness, of the diagonal", "completeness_diagonal", "strict", **{**PERCENT, "better": "lower"}),
+    _of("F at 1 % of the diagonal", "f", "strict", **PERCENT),
+    _of("IoU", "iou.paper", "paper", **PERCENT),
+    _of("IoU", "iou.published", "published", **PERCENT),
+    _of("SDF recall, points", "recall.paper", "paper", **PERCENT),
+    _of("SDF recall, objects", "recall.published", "published", **AT_LEAST),
+    _of("SDF recall, objects", "recall.strict", "strict", **AT_LEAST),
+    _of("watertight", "watertight", "strict", **PERCENT),
+    _of("time an object", "seconds", "", unit="s", better="lower"),
+]
+
+
+def main(options: Annotated[Settings, tyro.conf.arg(name="")]) -> None:
+    """Meshes of the method with and without joint optimisation, and of what one would use instead."""
+    data = benchmark(options)
+    config = preset(options.preset, upright=is_upright(options, data))
+    peers = SURFACERS if options.peers else {}
+    stated = {"methods": [*own_names(options.preset), *peers], "scans": options.scans}
+    current = start_run("reconstruction", options, {**stated, "samples": options.samples})
+    prior = load_prior(options.prior)
+
+    records = run_scenes(current, options, lambda s: work(s, prior, config, peers, options))
+    finish(current, options, FIGURES, records, ("category",))
+
+
+def own_names(name: str) -> tuple[str, str]:
+    """Of a single observation, the optimisation is that of its code."""
+    return f"ours, {name}", f"ours, {name}, without optimisation"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Seen:
+    """An object with what the first scans saw of it, laid into the first scan's frame under the true poses."""
+
+    scene: KnownScene
+    known: KnownObject
+    points: Float[np.ndarray, "n 3"]
+    point_scan: Int[np.ndarray, " n"]
+    observations: tuple[Observation, ...]
+
+
+def seen_objects(scenes: Sequence[KnownScene], scans: int) -> list[Seen]:
+    """The objects of the first scan that have a true mesh and that masks show."""
+    known = [(s, o) for s in scenes for o in s.objects if o.mesh is not None]
+    return [accumulated(s, o, scans) for s, o in known if o.instance.get(0, LOST) != LOST]
+
+
+def accumulated(scene: KnownScene, o: KnownObject, scans: int) -> Seen:
+    """What the first `scans` scans saw of an object."""
+    there = [k for k, i in o.instance.items() if k < scans and i != LOST]
+    poses = [o.true_pose(o, k, 0) for k in there]
+    clouds = [
+        apply_pose(T, scene.instance(k, o.instance[k]).points) for k, T in zip(there, poses, strict=True)
+    ]
+    return Seen(
+        scene=scene,
+        known=o,
+        points=np.concatenate(clouds),
+        point_scan=np.concatenate([np.full(len(c), k) for k, c in zip(there, clouds, strict=True)]),
+        observations=tuple(
+            Observation(scan=k, instance=o.instance[k], T_ref_scan=T, score=1.0, rms_m=0.0, converged=True)
+            for k, T in zip(there, poses, strict=True)
+        ),
+    )
+
+
+def work(
+    scenes: Sequence[KnownScene],
+    prior: Prior,
+    config: SceneConfig,
+    peers: Mapping[str, Surfacer],
+    o: Settings,
+) -> list[list[Record]]:
+    """All objects of some scenes: encoded, and optimised, together; then one mesh after the other."""
+    seen = seen_objects(scenes, o.scans)
+    plain, encoding_s = timed(lambda: embedded(prior, seen, o.batch), len(seen))
+    fitted, fitting_s = timed(lambda: fitted_in_batches(prior, plain, config, o.batch), len(seen))
+    with_it, without = own_names(o.preset)
+    records = []
+    for name, objects, spent_s in ((with_it, fitted, encoding_s + fitting_s), (without, plain, encoding_s)):
+        records += [
+            scored(s, name, lambda own=own: mesh_of(prior, own, config), spent_s, o.samples)
+            for s, own in zip(seen, objects, strict=True)
+        ]
+    for name, surface in peers.items():
+        records += [scored(s, name, lambda s=s, f=surface: f(s.points), 0.0, o.samples) for s in seen]
+    return [[r for n, r in records if n == scene.name] for scene in scenes]
+
+
+def timed(stage: Callable[[], list[SceneObject]], count: int) -> tuple[list[SceneObject], float]:
+    """What a stage returns, and the seconds it took for each of `count`."""
+    began = time.perf_counter()
+    result = stage()
+    return result, (time.perf_counter() - began) / max(1, count)
+
+
+def embedded(prior: Prior, seen: Sequence[Seen], batch: int) -> list[SceneObject]:
+    """The objects as a living scene has them."""
+    codes = embed_all(prior, [s.points for s in seen], batch)
+    return [
+        SceneObject(
+            id=f"object_{n:03d}",
+            label=s.known.category,
+            reference_scan=0,
+            observations=s.observations,
+            points=s.points,
+            point_scan=s.point_scan,
+            embedding=code,
+        )
+        for n, (s, code) in enumerate(zip(seen, codes, strict=True))
+    ]
+
+
+def fitted_in_batches(
+    prior: Prior, objects: Sequence[SceneObject], config: SceneConfig, batch: int
+) -> list[SceneObject]:
+    """Joint optimisation of every object, `batch` a call."""
+    found: list[SceneObject] = []
+    for start in range(0, len(objects), batch):
+        part = objects[start : start + batch]
+        found += fit_objects(prior, part, range(len(part)), config)
+    return found
+
+
+def scored(
+    s: Seen, method: str, make: Callable[[], Mesh | None], spent_s: float, samples: int
+) -> tuple[str, Record]:
+    """The record of one object, with its scene's name; `spent_s` came before the mesh."""
+    began = time.perf_counter()
+    mesh = make()
+    seconds = spent_s + time.perf_counter() - began
+    scores = mesh_scores(mesh, s.known, s.known.T_scan_model[0], samples)
+    head = {"method": method, "object": s.known.name, "category": s.known.category, "seconds": seconds}
+    return s.scene.name, {**head, **scores}
+
+
+if __name__ == "__main__":
+    run(main)

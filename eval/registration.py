@@ -1,0 +1,194 @@
+"""Where matched objects went: rotation errors, recalls and distances over true pairs (METHOD 4 and 9).
+
+`python -m eval.registration --data data/flying_sparse --out runs/registration --scenes 10`
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+import tyro
+
+from eval.batched import PairToRegister, embed_all, register_all
+from eval.figures import Figure, Record, in_columns
+from eval.masks import LOST
+from eval.options import Options, benchmark, is_upright
+from eval.peers.registration import Registrar, registrars
+from eval.plots import draw_ecdf
+from eval.pose_scores import Pose, pose_scores
+from eval.results import finish
+from eval.runs import run_scenes, start_run
+from eval.truth import KnownObject, KnownScene
+from more2_jax.config import RegistrationConfig, preset
+from more2_jax.prior import Prior, load_prior
+from train.program import run
+
+
+@dataclass(frozen=True, kw_only=True)
+class Settings(Options):
+    """Which data, which settings, and where results go."""
+
+    pairs: Literal["first", "all"] = "all"
+    """Every later scan onto the first, or only the second (as the published evaluation of FlyingShape has it)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TruePair:
+    """A true match: the object as scan `scan` saw it, onto how the first scan saw it."""
+
+    scene: KnownScene
+    object: KnownObject
+    scan: int
+
+    @property
+    def clouds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Source and target, each in its scan's frame."""
+        o = self.object
+        return self.scene.instance(self.scan, o.instance[self.scan]).points, self.scene.instance(
+            0, o.instance[0]
+        ).points
+
+
+def figures(right_deg: float) -> list[Figure]:
+    """The figures of METHOD 9; a success is a rotation error below `right_deg`."""
+    share = Figure(
+        name=f"RR, RE < {right_deg:g}°", key="re_deg", statistic="share", limit=right_deg, unit="%"
+    )
+    share = dataclasses.replace(share, scale=100)
+    median = Figure(name="MedRE", key="re_deg", statistic="median", unit="°", better="lower")
+    rmse = dataclasses.replace(median, name="median RMSE", key="rmse_m", unit="cm", scale=100)
+    # The published medians are over successes only.
+    of_successes = [
+        dataclasses.replace(f, successes=("re_deg.published", right_deg)) if f.column == "published" else f
+        for f in (*in_columns(median), *in_columns(rmse))
+    ]
+    strict = dataclasses.replace(share, column="strict")
+    distance = dataclasses.replace(median, name="MedCD", unit="m²")
+    return [
+        *in_columns(share),
+        dataclasses.replace(strict, name="RE < 10°", key="re_deg.strict", limit=10),
+        dataclasses.replace(strict, name="within 5 cm", key="te_m.strict", limit=0.05),
+        *of_successes,
+        dataclasses.replace(distance, key="cd_m2.paper", column="paper"),
+        dataclasses.replace(distance, key="cd_m2.published", column="published"),
+        dataclasses.replace(distance, key="cd_m.strict", column="strict", unit="cm", scale=100),
+        Figure(name="time a pair", key="seconds", statistic="mean", unit="s", better="lower"),
+    ]
+
+
+def main(options: Annotated[Settings, tyro.conf.arg(name="")]) -> None:
+    """Registration of true pairs by the method, without its optimisation, and by what one would use instead."""
+    data = benchmark(options)
+    upright = is_upright(options, data)
+    ours = own_settings(options.preset, upright)
+    peers = registrars() if options.peers else {}
+    current = start_run("registration", options, {"methods": [*ours, *peers], "pairs": options.pairs})
+    prior = load_prior(options.prior)
+
+    def work(scenes: Sequence[KnownScene]) -> list[list[Record]]:
+        pairs = [p for s in scenes for p in true_pairs(s, options.pairs)]
+        records = own_records(pairs, prior, ours, upright, options.batch) + peer_records(
+            pairs, peers, upright
+        )
+        return [[r for s, r in records if s == scene.name] for scene in scenes]
+
+    records = run_scenes(current, options, work)
+    finish(current, options, figures(data.right_deg), records, ("category",))
+    plot(current.out, records, 3 * data.right_deg)
+
+
+def own_settings(name: str, upright: bool) -> dict[str, RegistrationConfig]:
+    """The preset's registration, with and without its descent on the loss."""
+    config = preset(name, upright=upright).registration
+    return {
+        f"ours, {name}": config,
+        f"ours, {name}, without optimisation": dataclasses.replace(config, steps=0),
+    }
+
+
+def true_pairs(scene: KnownScene, which: str = "all") -> list[TruePair]:
+    """Objects that the first scan and a later one have, and masks show."""
+    last = 2 if which == "first" else len(scene.scans)
+    return [
+        TruePair(scene=scene, object=o, scan=k)
+        for k in range(1, last)
+        for o in scene.objects
+        if o.instance.get(0, LOST) != LOST and o.instance.get(k, LOST) != LOST
+    ]
+
+
+def own_records(
+    pairs: Sequence[TruePair],
+    prior: Prior,
+    settings: Mapping[str, RegistrationConfig],
+    upright: bool,
+    batch: int,
+) -> list[tuple[str, Record]]:
+    """The method on all pairs of some scenes; time is that of the batch, shared out."""
+    if not pairs:
+        return []
+    clouds = [p.clouds for p in pairs]
+    began = time.perf_counter()
+    codes = embed_all(prior, [c for pair in clouds for c in pair], batch)
+    encoding_s = (time.perf_counter() - began) / len(pairs)
+    ready = [
+        PairToRegister(source=s, target=t, source_code=codes[2 * k], target_code=codes[2 * k + 1])
+        for k, (s, t) in enumerate(clouds)
+    ]
+    found: list[tuple[str, Record]] = []
+    for name, config in settings.items():
+        began = time.perf_counter()
+        poses = register_all(prior, ready, config, upright, batch)
+        seconds = encoding_s + (time.perf_counter() - began) / len(pairs)
+        found += [scored(p, T, name, seconds) for p, T in zip(pairs, poses, strict=True)]
+    return found
+
+
+def peer_records(
+    pairs: Sequence[TruePair], peers: Mapping[str, Registrar], upright: bool
+) -> list[tuple[str, Record]]:
+    """What one would use instead, on the same clouds."""
+    found: list[tuple[str, Record]] = []
+    for name, register in peers.items():
+        for p in pairs:
+            began = time.perf_counter()
+            T = register(*p.clouds, upright)
+            found.append(scored(p, T, name, time.perf_counter() - began))
+    return found
+
+
+def scored(p: TruePair, T: Pose | None, method: str, seconds: float) -> tuple[str, Record]:
+    """The record of one pair, with its scene's name."""
+    scores = pose_scores(T, p.object, p.object, p.scan, 0, *p.clouds)
+    return p.scene.name, {
+        "method": method,
+        "object": p.object.name,
+        "category": p.object.category,
+        "to_scan": p.scan,
+        "seconds": seconds,
+        "pose": None if T is None else T.tolist(),
+        **scores,
+    }
+
+
+def plot(out: Path, records: Mapping[str, Sequence[Record]], limit_deg: float) -> None:
+    """ECDF of rotation errors and RMSE: by method, and of the method by category."""
+    flat = [r for rows in records.values() for r in rows]
+    if not flat:
+        return
+    ours = [r for r in flat if r["method"] == flat[0]["method"]]
+    label = "rotation error, strict [°]"
+    draw_ecdf(out / "ecdf_rotation", flat, "re_deg.strict", label, limit_deg)
+    draw_ecdf(out / "ecdf_rmse", flat, "rmse_m.strict", "RMSE, strict [m]", 0.5)
+    draw_ecdf(out / "ecdf_rotation_by_category", ours, "re_deg.strict", label, limit_deg, by="category")
+    draw_ecdf(out / "ecdf_rmse_by_category", ours, "rmse_m.strict", "RMSE, strict [m]", 0.5, by="category")
+
+
+if __name__ == "__main__":
+    run(main)
