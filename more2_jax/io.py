@@ -13,6 +13,7 @@ import os
 import shutil
 import zipfile
 import zlib
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +35,15 @@ from more2_jax.types import (
 
 VERSION = 1
 STAGES = ("encode", "match", "register", "joint", "mesh")
-WRITTEN = ("scene.json", "objects", "embeddings.npz", "report.html", "run.log", "config.yaml")
+WRITTEN = (
+    "scene.json",
+    "objects",
+    "background.ply",
+    "embeddings.npz",
+    "report.html",
+    "run.log",
+    "config.yaml",
+)
 EMBEDDING = ("inv", "eqv", "scale", "center", "origin")
 # What NumPy, zipfile, json, yaml and our own records raise for files that are damaged or missing.
 DAMAGE = (
@@ -125,12 +134,21 @@ def _fill(folder: Path, scene: LivingScene, config: SceneConfig, log: str) -> No
         write_points(folder / _points_name(o), o.points, o.point_scan)
         if o.mesh is not None:
             write_mesh(folder / _mesh_name(o), o.mesh)
+    _write_background(folder / "background.ply", scene.scans)
     stacked = {k: np.stack([np.asarray(getattr(o.embedding, k)) for o in scene.objects]) for k in EMBEDDING}
     ids = np.array([o.id for o in scene.objects])
     np.savez_compressed(folder / "embeddings.npz", **({"id": ids} | stacked))  # type: ignore[arg-type]
     (folder / "config.yaml").write_text(to_yaml(config), encoding="utf-8")
     (folder / "run.log").write_text(log, encoding="utf-8")
-    write_report(scene, folder / "report.html")
+    write_report(scene, folder / "report.html", config)
+
+
+def _write_background(path: Path, scans: Sequence[ScanRecord]) -> None:
+    """One cloud of what belongs to no object; no file where no scan has any."""
+    if not any(len(s.background) for s in scans):
+        return
+    owner = np.concatenate([np.full(len(s.background), s.index) for s in scans])
+    write_points(path, np.concatenate([s.background for s in scans]), owner)
 
 
 def _log_of(folder: Path) -> str:
@@ -235,8 +253,14 @@ def load_scene(folder: str | Path) -> tuple[LivingScene, SceneConfig]:
 
 def _scene(folder: Path, content: dict[str, Any]) -> LivingScene:
     embeddings = _embeddings(folder / "embeddings.npz")
+    background, owner = _background(folder / "background.ply")
     scans = [
-        s | {"instances": tuple(s["instances"]), "skipped": tuple(Skipped(**k) for k in s.get("skipped", []))}
+        s
+        | {
+            "instances": tuple(s["instances"]),
+            "skipped": tuple(Skipped(**k) for k in s.get("skipped", [])),
+            "background": background[owner == s["index"]],
+        }
         for s in content["scans"]
     ]
     kinds = ("moved", "static", "added", "removed")
@@ -253,6 +277,11 @@ def _scene(folder: Path, content: dict[str, Any]) -> LivingScene:
         timing_s=content["timing_s"],
         unit=content["unit"],
     )
+
+
+def _background(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """The background's points and their scans; none where the scene has no such file."""
+    return read_points(path) if path.is_file() else (np.zeros((0, 3)), np.zeros(0, np.int64))
 
 
 def _embeddings(path: Path) -> dict[str, Embedding]:

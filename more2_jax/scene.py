@@ -17,6 +17,8 @@ from more2_jax.progress import Watcher, staged
 from more2_jax.tracking import match_scan, register_scan
 from more2_jax.types import Instance, LivingScene, Mesh, Scan, ScanRecord, SceneObject, Skipped
 
+BACKGROUND_POINTS = 20_000  # of a scan, remembered for the page
+
 
 def start_scene(
     prior: Prior, scan: Scan, config: SceneConfig, *, progress: Watcher | None = None
@@ -124,6 +126,12 @@ def usable(scan: Scan, config: SceneConfig) -> tuple[list[Instance], tuple[Skipp
 
 
 def record(index: int, scan: Scan, instances: list[Instance], skipped: tuple[Skipped, ...]) -> ScanRecord:
-    """What the scene remembers of a scan."""
-    ids = tuple(i.id for i in instances)
-    return ScanRecord(index=index, name=scan.name, source=scan.source, instances=ids, skipped=skipped)
+    """What the scene remembers of a scan: of its background, points at even steps, `BACKGROUND_POINTS` at most."""
+    return ScanRecord(
+        index=index,
+        name=scan.name,
+        source=scan.source,
+        instances=tuple(i.id for i in instances),
+        skipped=skipped,
+        background=scan.background[:: max(1, -(-len(scan.background) // BACKGROUND_POINTS))],
+    )

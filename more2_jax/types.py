@@ -179,6 +179,9 @@ class ScanRecord:
     source: str
     instances: tuple[int, ...]
     skipped: tuple[Skipped, ...] = ()
+    background: Float[np.ndarray, "b 3"] = field(  # thinned, to look at; metres, in the scan's frame, float64
+        default_factory=lambda: np.zeros((0, 3)), compare=False, repr=False
+    )
 
 
 @dataclass(frozen=True, kw_only=True)

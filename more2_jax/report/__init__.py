@@ -1,0 +1,7 @@
+"""The page a person looks at: one HTML file that needs nothing else."""
+
+from more2_jax.report.page import report_html, write_report
+from more2_jax.report.palette import color, rgb
+from more2_jax.report.wording import motion_text
+
+__all__ = ["color", "motion_text", "report_html", "rgb", "write_report"]

@@ -1,0 +1,129 @@
+"""What goes into the page: numbers and words as JSON, points and meshes as one blob."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from more2_jax.config import SceneConfig
+from more2_jax.metrics import apply_pose
+from more2_jax.objects import points_of
+from more2_jax.report.blob import Blob
+from more2_jax.report.coverage import coverage
+from more2_jax.report.palette import color, ink
+from more2_jax.report.thinning import MOST_FACES, MOST_POINTS, share_of, simplified, thinned
+from more2_jax.report.wording import Verdict, changes_from, doubts_of, headline, phrase, verdict
+from more2_jax.types import LivingScene, Observation, ScanRecord, SceneObject
+
+Point = Float[np.ndarray, "3"]
+
+
+def pairs_of(scene: LivingScene) -> list[tuple[int, int]]:
+    """The pairs of scans the page compares: each with the one before, with the first, and the first alone."""
+    last = len(scene.scans)
+    return [(0, 0), *sorted({(a, b) for b in range(1, last) for a in (b - 1, 0)})]
+
+
+def verdicts_of(scene: LivingScene, config: SceneConfig) -> dict[tuple[int, int], list[Verdict]]:
+    """What became of every object, for every pair of `pairs_of`."""
+    changes = {pair: changes_from(scene, *pair, config) for pair in pairs_of(scene)}
+    return {pair: [verdict(o, c) for o in scene.objects] for pair, c in changes.items()}
+
+
+def payload(scene: LivingScene, config: SceneConfig) -> tuple[dict[str, Any], str]:
+    """The page's data: what goes in as JSON, and the text of its `Blob`.
+
+    Everything lies relative to the scene's middle, so that 32 bit floats of a graphics card are enough
+    kilometres away from the frame's zero. Lengths are metres, rotations quaternions (x, y, z, w).
+    """
+    blob = Blob()
+    clouds = [points_of(o, seen) for o in scene.objects for seen in o.observations]
+    everything = np.concatenate([*clouds, *(s.background for s in scene.scans)])
+    low, high = everything.min(axis=0), everything.max(axis=0)
+    middle = (low + high) / 2
+    points = share_of(len(everything), MOST_POINTS)
+    faces = share_of(sum(len(o.mesh.faces) for o in scene.objects if o.mesh is not None), MOST_FACES)
+    return {
+        "scans": [_scan(s, blob, points, middle) for s in scene.scans],
+        "objects": [_object(o, k, blob, points, faces, middle) for k, o in enumerate(scene.objects)],
+        "pairs": {f"{a}-{b}": _pair(scene, v, a, b) for (a, b), v in verdicts_of(scene, config).items()},
+        "size": (high - low).tolist(),
+        "share": {"points": points, "faces": faces},
+    }, blob.text()
+
+
+def _pair(scene: LivingScene, verdicts: list[Verdict], a: int, b: int) -> dict[str, Any]:
+    return {
+        "headline": headline(scene, verdicts, a, b),
+        "verdicts": [
+            {
+                "status": v.status,
+                "text": phrase(v),
+                "doubts": list(v.doubts),
+                "distance_m": v.distance_m,
+                "angle_deg": v.angle_deg,
+            }
+            for v in verdicts
+        ],
+    }
+
+
+def _scan(s: ScanRecord, blob: Blob, share: float, middle: Point) -> dict[str, Any]:
+    has = len(s.background) > 0
+    background = blob.add_points(thinned(s.background - middle, share)) if has else None
+    return {"name": s.name, "background": background}
+
+
+def _object(
+    o: SceneObject, number: int, blob: Blob, points: float, faces: float, middle: Point
+) -> dict[str, Any]:
+    """One object; its cloud and mesh relative to `anchor`, the mean of its points in the reference frame."""
+    anchor = o.points.mean(axis=0)
+    parts = [thinned(o.points[o.point_scan == seen.scan], points) for seen in o.observations]
+    mesh = None if o.mesh is None else simplified(o.mesh, faces)
+    return {
+        "id": o.id,
+        "number": number,
+        "name": name_of(o, number),
+        "color": color(number),
+        "ink": ink(number),
+        "coverage": None if o.mesh is None else coverage(o.mesh, o.points),
+        "observations": [_observation(o, seen, anchor, middle) for seen in o.observations],
+        "cloud": blob.add_points(np.concatenate(parts) - anchor),
+        "counts": [len(p) for p in parts],
+        "mesh": None
+        if mesh is None
+        else {
+            "vertices": blob.add_points(mesh.vertices - anchor),
+            "faces": blob.add(mesh.faces.reshape(-1).astype(_index_type(len(mesh.vertices)))),
+        },
+    }
+
+
+def _index_type(vertices: int) -> type[np.uint16] | type[np.uint32]:
+    return np.uint16 if vertices <= 65536 else np.uint32
+
+
+def _observation(o: SceneObject, seen: Observation, anchor: Point, middle: Point) -> dict[str, Any]:
+    """Where the object lies in one scan, and how sure that is."""
+    T_scan_ref = np.linalg.inv(seen.T_ref_scan)
+    mine = o.point_scan == seen.scan
+    reference = seen.scan == o.reference_scan
+    return {
+        "scan": seen.scan,
+        "position": (apply_pose(T_scan_ref, anchor[None])[0] - middle).tolist(),
+        "quaternion": Rotation.from_matrix(T_scan_ref[:3, :3]).as_quat().tolist(),
+        "score": None if reference else seen.score,
+        "rms_mm": None if reference else 1000 * seen.rms_m,
+        "doubts": doubts_of(o, seen),
+        "points": int(mine.sum()),
+        "coverage": None if o.mesh is None else coverage(o.mesh, o.points[mine]),
+    }
+
+
+def name_of(o: SceneObject, number: int) -> str:
+    """What a person calls it: its label, else `object 3`."""
+    return o.label or f"object {number}"

@@ -1,0 +1,114 @@
+"""What happened, in plain words: an object between two scans, and a whole room."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+from more2_jax.config import SceneConfig
+from more2_jax.objects import changes_between, motion_between, observation_in
+from more2_jax.types import Changes, LivingScene, Observation, SceneObject
+
+LOW_SCORE = 0.3  # a match below it is told as unsure; same objects usually score 0.5 to 0.9
+
+Status = Literal["moved", "static", "added", "removed", "present", "absent"]
+STATES: tuple[Status, ...] = ("moved", "added", "removed", "static")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Verdict:
+    """What became of one object between two scans. Distance and angle are None unless both show it."""
+
+    status: Status
+    distance_m: float | None = None
+    angle_deg: float | None = None
+    doubts: tuple[str, ...] = ()  # why it is unsure; empty when it is not
+
+
+def changes_from(scene: LivingScene, a: int, b: int, config: SceneConfig) -> Changes:
+    """The changes between scans `a` and `b`: those of the scene where it has them, else worked out."""
+    known = next((c for c in scene.changes if (c.from_scan, c.to_scan) == (a, b)), None)
+    return known or changes_between(scene.objects, a, b, config)
+
+
+def verdict(o: SceneObject, changes: Changes) -> Verdict:
+    """What became of an object between the scans of `changes`; in one and the same scan, whether it is there."""
+    before, after = observation_in(o, changes.from_scan), observation_in(o, changes.to_scan)
+    doubts = tuple(d for seen in (before, after) if seen for d in doubts_of(o, seen))
+    if changes.from_scan == changes.to_scan:
+        return Verdict(status="present" if after else "absent", doubts=doubts)
+    told: list[Status] = [s for s in STATES if o.id in getattr(changes, s)]
+    status = told[0] if told else "absent"
+    if before is None or after is None:
+        return Verdict(status=status, doubts=doubts)
+    distance_m, angle_deg = motion_between(o, before, after)
+    return Verdict(status=status, distance_m=distance_m, angle_deg=angle_deg, doubts=doubts)
+
+
+def doubts_of(o: SceneObject, seen: Observation) -> list[str]:
+    """Why an observation may be wrong, in words. The reference observation defines the object: no doubt."""
+    if seen.scan == o.reference_scan:
+        return []
+    doubts = [] if seen.converged else ["its new position did not settle"]
+    if seen.score < LOW_SCORE:
+        doubts.append(f"it may be another object: match score {seen.score:.2f}, below {LOW_SCORE:.2f}")
+    return doubts
+
+
+def motion_text(o: SceneObject, changes: Changes) -> str:
+    """What happened to the object between two scans: `moved 2.00 m, 90.0°`, `static`, … or `absent`."""
+    v = verdict(o, changes)
+    if v.distance_m is None:
+        return v.status
+    return f"{v.status} {v.distance_m:.2f} m, {v.angle_deg:.1f}°"
+
+
+def phrase(v: Verdict) -> str:
+    """A verdict as a person would say it."""
+    if v.status == "moved":
+        return _moved(v.distance_m or 0.0, v.angle_deg or 0.0)
+    words = {
+        "static": "stayed where it was",
+        "added": "added",
+        "removed": "removed",
+        "present": "here",
+        "absent": "not here",
+    }
+    return words[v.status]
+
+
+def _moved(distance_m: float, angle_deg: float) -> str:
+    """`moved by 1.20 m and turned by 35°`; below a centimetre or a degree only the other is said."""
+    far, turned = distance_m >= 0.01, angle_deg >= 0.5
+    length = f"{100 * distance_m:.0f} cm" if distance_m < 1 else f"{distance_m:.2f} m"
+    if far and turned:
+        return f"moved by {length} and turned by {angle_deg:.0f}°"
+    return f"turned by {angle_deg:.0f}°" if turned else f"moved by {length}"
+
+
+def headline(scene: LivingScene, verdicts: Sequence[Verdict], a: int, b: int) -> str:
+    """One sentence on a room: `Between monday and friday: 3 objects moved, 1 was added, 2 stayed.`"""
+    counts = Counter(v.status for v in verdicts)
+    if a == b:
+        return f"{scene.scans[b].name}: {_objects(counts['present'])} found."
+    first = True
+    parts = []
+    for status, one, more in (
+        ("moved", "moved", "moved"),
+        ("added", "was added", "were added"),
+        ("removed", "was removed", "were removed"),
+        ("static", "stayed", "stayed"),
+    ):
+        if n := counts[status]:
+            parts.append(f"{_objects(n) if first else n} {one if n == 1 else more}")
+            first = False
+    doubtful = sum(bool(v.doubts) for v in verdicts if v.status != "absent")
+    unsure = f" {doubtful} of these {'is' if doubtful == 1 else 'are'} unsure." if doubtful else ""
+    told = ", ".join(parts) or "no object is in either"
+    return f"Between {scene.scans[a].name} and {scene.scans[b].name}: {told}.{unsure}"
+
+
+def _objects(n: int) -> str:
+    return f"{n} object{'' if n == 1 else 's'}"
