@@ -138,18 +138,24 @@ class Inspect:
 
 @dataclass(frozen=True)
 class Show:
-    """Path of the page of a living scene; with a display, opens it.
+    """Path of the page of a living scene; with a display, opens it. Or serves it, to this machine only.
 
-    Example: more2 show my_room
+    Example: more2 show my_room --serve
     """
 
     folder: Positional[Path]
     """The living scene."""
     open: bool = True
     """Open the page where there is a display."""
+    serve: bool = False
+    """Serve the page and the exports at 127.0.0.1 until ctrl-C."""
+    port: int = 0
+    """With serve: the port; 0 takes a free one."""
 
     def __call__(self) -> int:
-        scenes.show(self.folder, self.open)
+        if self.port and not self.serve:
+            raise ValueError(f"--port {self.port} without --serve; needed both, or neither")
+        scenes.show(self.folder, self.open, self.serve, self.port)
         return 0
 
 

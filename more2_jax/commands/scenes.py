@@ -9,6 +9,7 @@ import webbrowser
 from pathlib import Path
 
 from more2_jax.commands.options import Reading
+from more2_jax.commands.server import address_of, scene_server, serve_until_interrupted
 from more2_jax.commands.session import Session
 
 
@@ -21,16 +22,20 @@ def inspect(path: Path, reading: Reading, masks: Path | None, min_points: int) -
     Session().say(format_report(inspect_scan(scan)))
 
 
-def show(folder: Path, open_page: bool) -> None:
-    """Prints where the page lies and, with a display, opens it."""
+def show(folder: Path, open_page: bool, serve: bool = False, port: int = 0) -> None:
+    """Prints where the page lies and, with a display, opens it; or serves it to this machine until ctrl-C."""
     from more2_jax.io import stored_at
 
     page = stored_at(folder) / "report.html"
     if not (page.parent / "scene.json").is_file() or not page.is_file():
         raise ValueError(f"{folder}: no living scene with a page; `more2 run` makes one")
-    Session().say(str(page))
+    server = scene_server(page.parent, port) if serve else None
+    address = page.as_uri() if server is None else address_of(server)
+    Session().say(str(page) if server is None else f"{address} (ctrl-C ends)")
     if open_page and has_display():
-        webbrowser.open(page.as_uri())
+        webbrowser.open(address)
+    if server is not None:
+        serve_until_interrupted(server)
 
 
 def has_display() -> bool:

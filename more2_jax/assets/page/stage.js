@@ -42,8 +42,7 @@ class Stage {
 
   /** The view from which the whole room is seen. */
   home() {
-    const upright = this.aspect() < 1;
-    const away = this.extent * (upright ? 1.35 : 1.03);
+    const away = this.extent * 1.03 * Math.max(1, 1.15 / this.aspect()); // narrow views see less to the sides
     this.controls.target.set(0, 0, -0.25 * scene.size[2]);
     this.camera.position.set(-0.55, -0.95, 0.85).setLength(away).add(this.controls.target);
     this.camera.near = this.extent / 500;
