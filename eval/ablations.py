@@ -20,16 +20,16 @@ from eval.figures import Figure, Record, in_columns
 from eval.matching import RECALL, match_own
 from eval.matching import record as match_record
 from eval.mesh_scores import RECONSTRUCTED, mesh_scores
-from eval.options import Options, benchmark, is_upright
+from eval.options import Options
 from eval.pose_scores import pose_scores
 from eval.reconstruction import Seen, embedded, fitted_in_batches, seen_objects
 from eval.registration import own_records, own_settings, true_pairs
 from eval.results import finish
 from eval.runs import run_scenes, start_run
 from eval.truth import KnownScene
-from more2_jax.config import JointConfig, MatchingConfig, SceneConfig, preset
+from more2_jax.config import JointConfig, MatchingConfig, SceneConfig
 from more2_jax.fitting import repose
-from more2_jax.prior import Prior, load_prior
+from more2_jax.prior import Prior
 from more2_jax.scene import mesh_of
 from more2_jax.types import SceneObject
 from train.program import run
@@ -92,9 +92,8 @@ class Settings(Options):
 
 def main(options: Annotated[Settings, tyro.conf.arg(name="")]) -> None:
     """One table a study; methods are named after the study and the setting."""
-    data = benchmark(options)
-    config, prior = preset(options.preset, upright=is_upright(options, data)), load_prior(options.prior)
     current = start_run("ablations", options, {"scans": options.scans, "samples": options.samples})
+    prior, config = current.prior, current.config
 
     def work(scenes: Sequence[KnownScene]) -> list[list[Record]]:
         found = [*matching_study(scenes, prior, options), *registration_study(scenes, prior, config, options)]

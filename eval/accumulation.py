@@ -21,15 +21,15 @@ from eval.end_to_end import living_scenes, on_all_devices
 from eval.figures import Figure, Record
 from eval.masks import LOST
 from eval.mesh_scores import mesh_scores, surface_points
-from eval.options import Options, benchmark, is_upright
+from eval.options import Options
 from eval.plots import draw_over_scans
 from eval.results import finish
 from eval.runs import run_scenes, start_run
 from eval.tracks import Track, pair_record, track_with, tracks_of
 from eval.truth import KnownObject, KnownScene
-from more2_jax.config import SceneConfig, preset
+from more2_jax.config import SceneConfig
 from more2_jax.metrics import apply_pose
-from more2_jax.prior import Prior, load_prior
+from more2_jax.prior import Prior
 from more2_jax.scene import reconstruct
 from train.program import run
 
@@ -61,12 +61,11 @@ class Settings(Options):
 
 def main(options: Annotated[Settings, tyro.conf.arg(name="")]) -> None:
     """Coverage, rotation error and Chamfer distance over the number of scans."""
-    data = benchmark(options)
-    config, prior = preset(options.preset, upright=is_upright(options, data)), load_prior(options.prior)
     current = start_run("accumulation", options, {"samples": options.samples})
 
     def one(scene: KnownScene) -> list[Record]:
-        found = scene_records(scene, prior, config, data.right_deg, options.samples)
+        right_deg = current.data.right_deg
+        found = scene_records(scene, current.prior, current.config, right_deg, options.samples)
         return [{"method": f"ours, {options.preset}", **r} for r in found]
 
     records = run_scenes(current, options, lambda scenes: on_all_devices(one, scenes))

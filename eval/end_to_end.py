@@ -18,14 +18,14 @@ import jax
 import tyro
 
 from eval.figures import Figure, Record, in_columns
-from eval.options import Options, benchmark, is_upright
+from eval.options import Options
 from eval.peers.end_to_end import NAME, combined
 from eval.results import finish
 from eval.runs import run_scenes, start_run
 from eval.tracks import Track, changes_f1, score_tracks, tracks_of
 from eval.truth import KnownScene
-from more2_jax.config import SceneConfig, preset
-from more2_jax.prior import Prior, load_prior
+from more2_jax.config import SceneConfig
+from more2_jax.prior import Prior
 from more2_jax.scene import add_scan, reconstruct, start_scene
 from more2_jax.types import LivingScene
 from train.program import run
@@ -55,20 +55,20 @@ def figures() -> list[Figure]:
 
 def main(options: Annotated[Settings, tyro.conf.arg(name="")]) -> None:
     """MR and MRR of the method, and of the best of each other stage combined."""
-    data = benchmark(options)
-    upright = is_upright(options, data)
-    config, prior = preset(options.preset, upright=upright), load_prior(options.prior)
-    methods: dict[str, Callable[[KnownScene], list[Track]]] = {
-        f"ours, {options.preset}": lambda s: tracks_of(living_scene(s, prior, config))
-    }
-    if options.peers:
-        methods[NAME] = lambda s: combined(s.scans, upright)
-    stated = {"methods": list(methods), "samples": options.samples}
-    current = start_run("end_to_end", options, stated)
+    names = [f"ours, {options.preset}", *([NAME] if options.peers else [])]
+    current = start_run("end_to_end", options, {"methods": names, "samples": options.samples})
+    prior, config = current.prior, current.config
+    both: list[Callable[[KnownScene], list[Track]]] = [
+        lambda s: tracks_of(living_scene(s, prior, config)),
+        lambda s: combined(s.scans, config.upright),
+    ]
+    methods = dict(zip(names, both, strict=False))
 
     def one(scene: KnownScene) -> list[Record]:
         return [
-            r for n, m in methods.items() for r in records_of(scene, n, m, data.right_deg, options.samples)
+            r
+            for n, m in methods.items()
+            for r in records_of(scene, n, m, current.data.right_deg, options.samples)
         ]
 
     records = run_scenes(current, options, lambda scenes: on_all_devices(one, scenes))

@@ -25,7 +25,7 @@ from eval.runs import run_scenes, start_run
 from eval.truth import KnownScene
 from more2_jax.config import MatchingConfig, SceneConfig, preset
 from more2_jax.objects import new_object
-from more2_jax.prior import Prior, load_prior
+from more2_jax.prior import Prior
 from more2_jax.tracking import match_scan
 from more2_jax.types import Embedding, Instance
 from train.program import run
@@ -62,9 +62,10 @@ def main(options: Annotated[Options, tyro.conf.arg(name="")]) -> None:
     upright = is_upright(options, benchmark(options))
     peers = matchers(upright) if options.peers else {}
     current = start_run("matching", options, {"methods": [*methods, *peers]})
-    prior = load_prior(options.prior)
     settings = {n: replace(preset(options.preset, upright=upright), matching=m) for n, m in methods.items()}
-    records = run_scenes(current, options, lambda scenes: work(scenes, prior, settings, peers, options.batch))
+    records = run_scenes(
+        current, options, lambda scenes: work(scenes, current.prior, settings, peers, options.batch)
+    )
     finish(current, options, FIGURES, records, ("to_scan",))
 
 

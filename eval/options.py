@@ -41,6 +41,8 @@ class Options:
     """Clouds or pairs a compiled call takes; shared by all devices."""
     split: Literal["train", "validation", "test"] = "validation"
     """Of 3rscan."""
+    fresh: bool = False
+    """Forget an earlier run in `out` if its settings, weights or data are others."""
     distributed: bool = False
     """Several hosts, each with its share of the scenes: jax.distributed, set up by the cluster."""
 

@@ -21,15 +21,15 @@ from eval.batched import embed_all
 from eval.figures import Column, Figure, Record
 from eval.masks import LOST
 from eval.mesh_scores import RECONSTRUCTED, mesh_scores
-from eval.options import Options, benchmark, is_upright
+from eval.options import Options
 from eval.peers.reconstruction import SURFACERS, Surfacer
 from eval.results import finish
 from eval.runs import run_scenes, start_run
 from eval.truth import KnownObject, KnownScene
-from more2_jax.config import SceneConfig, preset
+from more2_jax.config import SceneConfig
 from more2_jax.fitting import fit_objects
 from more2_jax.metrics import apply_pose
-from more2_jax.prior import Prior, load_prior
+from more2_jax.prior import Prior
 from more2_jax.scene import mesh_of
 from more2_jax.types import Mesh, Observation, SceneObject
 from train.program import run
@@ -74,14 +74,11 @@ FIGURES = [
 
 def main(options: Annotated[Settings, tyro.conf.arg(name="")]) -> None:
     """Meshes of the method with and without joint optimisation, and of what one would use instead."""
-    data = benchmark(options)
-    config = preset(options.preset, upright=is_upright(options, data))
     peers = SURFACERS if options.peers else {}
     stated = {"methods": [*own_names(options.preset), *peers], "scans": options.scans}
     current = start_run("reconstruction", options, {**stated, "samples": options.samples})
-    prior = load_prior(options.prior)
 
-    records = run_scenes(current, options, lambda s: work(s, prior, config, peers, options))
+    records = run_scenes(current, options, lambda s: work(s, current.prior, current.config, peers, options))
     finish(current, options, FIGURES, records, ("category",))
 
 

@@ -26,7 +26,7 @@ from eval.results import finish
 from eval.runs import run_scenes, start_run
 from eval.truth import KnownObject, KnownScene
 from more2_jax.config import RegistrationConfig, preset
-from more2_jax.prior import Prior, load_prior
+from more2_jax.prior import Prior
 from train.program import run
 
 
@@ -89,11 +89,10 @@ def main(options: Annotated[Settings, tyro.conf.arg(name="")]) -> None:
     ours = own_settings(options.preset, upright)
     peers = registrars() if options.peers else {}
     current = start_run("registration", options, {"methods": [*ours, *peers], "pairs": options.pairs})
-    prior = load_prior(options.prior)
 
     def work(scenes: Sequence[KnownScene]) -> list[list[Record]]:
         pairs = [p for s in scenes for p in true_pairs(s, options.pairs)]
-        records = own_records(pairs, prior, ours, upright, options.batch) + peer_records(
+        records = own_records(pairs, current.prior, ours, upright, options.batch) + peer_records(
             pairs, peers, upright
         )
         return [[r for s, r in records if s == scene.name] for scene in scenes]

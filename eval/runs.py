@@ -7,6 +7,7 @@ import hashlib
 import json
 import os
 import platform
+import shutil
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -26,8 +27,10 @@ from rich.progress import (
 from eval.figures import Record
 from eval.flyingshape import digest
 from eval.masks import DAMAGES, with_masks
-from eval.options import Options, benchmark
+from eval.options import Options, benchmark, is_upright
 from eval.truth import Benchmark, KnownScene
+from more2_jax.config import SceneConfig, preset
+from more2_jax.prior import Prior, load_prior
 
 VERSION = 1
 Work = Callable[[Sequence[KnownScene]], Sequence[list[Record]]]  # records of every scene of a chunk
@@ -41,6 +44,8 @@ class Run:
     data: Benchmark
     names: tuple[str, ...]
     settings: dict[str, Any]
+    prior: Prior
+    config: SceneConfig
 
     def file(self, name: str) -> Path:
         """Where a scene's records are kept."""
@@ -52,29 +57,52 @@ class Run:
 
 
 def start_run(program: str, o: Options, settings: dict[str, Any]) -> Run:
-    """Opens or resumes the run in `o.out`. Raises ValueError if that folder holds a run of other settings."""
+    """Opens or resumes the run in `o.out`.
+
+    Raises ValueError if that folder holds a run of other settings, weights or data, unless `o.fresh`.
+    """
     if o.distributed:
         jax.distributed.initialize()
-    data = benchmark(o)
-    names = data.names[: o.scenes or None]
+    data, prior = benchmark(o), load_prior(o.prior)
+    config = preset(o.preset, upright=is_upright(o, data))
     stated = {
         "version": VERSION,
         "program": program,
         "data": {**data.facts, "digest": digest(o.data)},
         "prior": o.prior,
+        "weights": weights_digest(prior),
         "preset": o.preset,
+        "config": dataclasses.asdict(config),
         "masks": o.masks,
-        "upright": o.upright,
         **settings,
     }
-    stated = json.loads(json.dumps(stated))
-    path = o.out / "settings.json"
-    if path.exists() and (found := json.loads(path.read_text())) != stated:
+    claim(o.out, json.loads(json.dumps(stated)), fresh=o.fresh)
+    names = data.names[: o.scenes or None]
+    return Run(out=o.out, data=data, names=names, settings=stated, prior=prior, config=config)
+
+
+def claim(out: Path, stated: dict[str, Any], *, fresh: bool) -> None:
+    """Makes a folder that of a run. Raises ValueError if it is another's, unless `fresh`, which forgets that."""
+    path = out / "settings.json"
+    found = json.loads(path.read_text()) if path.exists() else stated
+    if found != stated:
         other = sorted(k for k in stated.keys() | found.keys() if stated.get(k) != found.get(k))
-        raise ValueError(f"{o.out}: holds a run with other {', '.join(other)}; needed an empty folder")
-    (o.out / "scenes").mkdir(parents=True, exist_ok=True)
+        if not fresh:
+            raise ValueError(
+                f"{out}: holds a run with other {', '.join(other)}; needed an empty folder, or --fresh"
+            )
+        if jax.process_index() == 0:
+            shutil.rmtree(out / "scenes", ignore_errors=True)
+    (out / "scenes").mkdir(parents=True, exist_ok=True)
     write_json(path, stated)
-    return Run(out=o.out, data=data, names=names, settings=stated)
+
+
+def weights_digest(prior: Prior) -> str:
+    """Names weights by their values."""
+    content = hashlib.sha256()
+    for leaf in jax.tree.leaves(prior.params):
+        content.update(np.ascontiguousarray(leaf).tobytes())
+    return content.hexdigest()[:12]
 
 
 def run_scenes(run: Run, o: Options, work: Work) -> dict[str, list[Record]]:
@@ -148,8 +176,3 @@ def hardware() -> str:
 
 def _lines(path: Path) -> list[str]:
     return path.read_text(errors="replace").splitlines() if path.is_file() else []
-
-
-def file_digest(path: Path) -> str:
-    """Short hash of a file's content."""
-    return hashlib.sha256(path.read_bytes()).hexdigest()[:12]

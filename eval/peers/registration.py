@@ -28,6 +28,7 @@ GICP_VOXEL, GICP_REACH, GICP_STEPS = 0.02, 0.1, 30  # shares of the diagonal
 TRUNCATED = 0.1  # a point farther than this from the other cloud counts as this far
 RANSAC_DRAWS = 100_000
 INLIER = 1.5 * VOXEL
+FEWEST = 64  # points: on next to nothing KISS-Matcher ends the whole process
 
 
 def fpfh_ransac(source: Points, target: Points, upright: bool) -> Pose | None:
@@ -72,6 +73,8 @@ def _by_features(source: Points, target: Points, find: Callable[[Featured, Featu
 
 def kiss(source: Points, target: Points, upright: bool) -> Pose | None:
     """KISS-Matcher, for upright objects with its solver for turns about the vertical, then GICP."""
+    if min(len(source), len(target)) < FEWEST:
+        return None
     kiss_matcher, unit = library("kiss_matcher"), diagonal(target)
     config = kiss_matcher.KISSMatcherConfig(VOXEL, use_quatro=upright)
     clouds = [((p - p.mean(axis=0)) / unit).astype(np.float32) for p in (source, target)]
