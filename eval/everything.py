@@ -44,6 +44,8 @@ class Settings:
     """Name of shipped weights, or a file."""
     scenes: int = 0
     """How many of each, from the first; 0 for all."""
+    visits: int = 0
+    """How many scans of each scene, from the first; 0 for all."""
     programs: tuple[Program, ...] = tuple(PROGRAMS)
     """Which."""
     scans: tuple[int, ...] = (1, 5)
@@ -94,6 +96,7 @@ def one(s: Settings, data: Path, preset: str, program: Program, extra: dict[str,
         "preset": preset,
         "prior": s.prior,
         "scenes": s.scenes,
+        "visits": s.visits,
         "peers": s.peers and preset == s.presets[0],
         "fresh": s.fresh,
         "samples": s.samples,

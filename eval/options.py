@@ -29,6 +29,8 @@ class Options:
     """Name of shipped weights, or a file."""
     scenes: int = 0
     """How many, from the first; 0 for all."""
+    visits: int = 0
+    """How many scans of each scene, from the first; 0 for all."""
     masks: Masks = "true"
     """true, damaged on purpose, or (3rscan) predicted: mask3d.labels.npz beside each scan."""
     upright: Literal["auto", "yes", "no"] = "auto"
@@ -51,9 +53,10 @@ def benchmark(o: Options) -> Benchmark:
     """The data. Raises ValueError if there are none of that kind, or the masks are not to be had."""
     if not o.data.is_dir():
         raise ValueError(f"{o.data}: no such folder")
-    if o.scenes < 0 or o.chunk < 1 or o.batch < 1:
+    if o.scenes < 0 or o.visits < 0 or o.visits == 1 or o.chunk < 1 or o.batch < 1:
         raise ValueError(
-            f"scenes {o.scenes}, chunk {o.chunk}, batch {o.batch}; needed 0 or more, and positive"
+            f"scenes {o.scenes}, visits {o.visits}, chunk {o.chunk}, batch {o.batch}; needed 0 (all) or more,"
+            " two visits at least, positive chunk and batch"
         )
     if o.dataset == "3rscan":
         return threerscan(o.data, split=o.split, predicted=o.masks == "predicted")

@@ -68,6 +68,7 @@ def draw_over_scans(path: Path, rows: Sequence[Row], names: Mapping[str, str]) -
             axes.set_xticks(x)
         axes.set(xlabel="scans", ylabel=label)
         axes.grid(alpha=0.3)
-    panels[0][0].legend(fontsize=7)
+    if panels[0][0].lines:
+        panels[0][0].legend(fontsize=7)
     figure.tight_layout()
     return save(figure, path)

@@ -121,6 +121,7 @@ def title(result: Result) -> str:
     extras = (
         [f"{s['scans']} scan{'s' if s['scans'] > 1 else ''}"] if result.program == "reconstruction" else []
     )
+    extras += [f"first {s['visits']} scans"] if s.get("visits") else []
     extras += [f"masks {s['masks']}"] if s["masks"] != "true" else []
     return ", ".join([TITLES[result.program], f"preset {s['preset']}", *extras])
 

@@ -74,6 +74,7 @@ def start_run(program: str, o: Options, settings: dict[str, Any]) -> Run:
         "preset": o.preset,
         "config": dataclasses.asdict(config),
         "masks": o.masks,
+        "visits": o.visits,
         **settings,
     }
     claim(o.out, json.loads(json.dumps(stated)), fresh=o.fresh)
@@ -115,7 +116,7 @@ def run_scenes(run: Run, o: Options, work: Work) -> dict[str, list[Record]]:
     with progress_bar() as bar:
         task = bar.add_task(run.settings["program"], total=len(mine), completed=len(mine) - len(todo))
         for names in chunks(todo, o.chunk):
-            scenes = [masked(run.data.read(n), o.masks) for n in names]
+            scenes = [masked(run.data.read(n).first_scans(o.visits), o.masks) for n in names]
             for name, records in zip(names, work(scenes), strict=True):
                 write_json(run.file(name), records)
                 bar.advance(task)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -51,6 +51,20 @@ class KnownScene:
     scans: tuple[Scan, ...]
     objects: tuple[KnownObject, ...]
     facts: dict[str, Any] = field(default_factory=dict)
+
+    def first_scans(self, count: int) -> KnownScene:
+        """The scene as if only its first scans had been made; 0 for all."""
+        if not count or count >= len(self.scans):
+            return self
+        objects = [
+            replace(
+                o,
+                instance={k: i for k, i in o.instance.items() if k < count},
+                T_scan_model={k: T for k, T in o.T_scan_model.items() if k < count},
+            )
+            for o in self.objects
+        ]
+        return replace(self, scans=self.scans[:count], objects=tuple(o for o in objects if o.instance))
 
     def owner(self, scan: int, instance: int) -> KnownObject | None:
         """The object that an instance of a scan shows."""
