@@ -30,7 +30,7 @@ class Labels {
         const { id, number, name } = built.object;
         tag.textContent = id !== selected ? number : name === `object ${number}` ? name : `${number} ${name}`;
         tag.classList.toggle("off", selected !== null && id !== selected);
-        tag.style.transform = `translate(${at.x.toFixed(1)}px, ${at.y.toFixed(1)}px) translate(-50%, -100%)`;
+        tag.style.transform = `translate(${Math.round(at.x)}px, ${Math.round(at.y)}px) translate(-50%, -100%)`;
       }
     }
   }
