@@ -38,6 +38,12 @@ class DecoderConfig:
     layers: int = 8  # hidden layers
     skip_layer: int = 4  # 0-based: the input is concatenated before this one
     dropout: float = 0.2  # while training
+    narrow_skip: bool = True  # as published: the layer before gives way, so that the skip layer sees `hidden`
+    local_blocks: tuple[
+        int, ...
+    ] = ()  # 0-based encoder blocks whose points and features the decoder looks up
+    local_channels: int = 16  # of every level and bandwidth
+    bandwidths: tuple[float, ...] = (0.05, 0.15)  # at the start of training, canonical units
 
 
 @dataclass(frozen=True)
@@ -162,6 +168,9 @@ class TrainingConfig:
     contrast_weight: float = 0.05  # InfoNCE on F_inv between two partial clouds of one shape
     contrast_temperature: float = 0.07
     turn_weight: float = 0.5  # ‖F_eqv − F_eqv'‖² between them: same orientation in, same vectors out
+    sign_weight: float = 0.0  # cross-entropy of inside and outside
+    sign_width: float = 0.01  # canonical units: where its sigmoid has half of its height
+    up_weight: float = 0.0  # the first third of F_eqv should point up
     validate_every: int = 250
     seed: int = 0
 

@@ -9,6 +9,7 @@ from jax import Array
 from jaxtyping import Float
 
 from more2_jax.config import PriorConfig
+from more2_jax.local_field import LocalField, LocalLookup, local_width
 from more2_jax.types import Embedding, pytree
 
 Affine = tuple[Float[Array, "4 h"], Float[Array, " h"]]
@@ -25,6 +26,7 @@ class ObjectField:
     skip: Affine
     scale: Float[Array, ""]
     center: Float[Array, "3"]
+    local: tuple[LocalField, ...] = ()
 
 
 class WeightNormDense(nn.Module):
@@ -47,10 +49,18 @@ class Decoder(nn.Module):
     config: PriorConfig
 
     def setup(self) -> None:
-        d, code = self.config.decoder, self.config.encoder.code
-        self.input_width = 2 * code + 1
+        d, e = self.config.decoder, self.config.encoder
+        self.lookups = [
+            LocalLookup(d.local_channels, d.bandwidths, e.widths[i], name=f"local_{i}")
+            for i in d.local_blocks
+        ]
+        self.looked_up = len(d.local_blocks) * local_width(d.local_channels, len(d.bandwidths))
+        self.code_width = 2 * e.code + 1
+        self.input_width = self.code_width + self.looked_up
         widths = [d.hidden] * d.layers
-        widths[d.skip_layer - 1] -= self.input_width  # so that the skip layer's input is `hidden` wide again
+        if d.narrow_skip:
+            # So that the skip layer's input is `hidden` wide again.
+            widths[d.skip_layer - 1] -= self.input_width
         self.hidden = [WeightNormDense(w, name=f"layer_{i}") for i, w in enumerate(widths)]
         self.output = nn.Dense(1, name=f"layer_{d.layers}")
         self.dropout = nn.Dropout(d.dropout)
@@ -59,10 +69,9 @@ class Decoder(nn.Module):
         """Every hidden layer's kernel and bias, weight normalisation applied."""
         d = self.config.decoder
         inputs = [self.input_width] + [d.hidden] * (d.layers - 1)
-        return [
-            dense(i if n != d.skip_layer else d.hidden)
-            for n, (dense, i) in enumerate(zip(self.hidden, inputs, strict=True))
-        ]
+        if not d.narrow_skip:
+            inputs[d.skip_layer] += self.input_width
+        return [dense(i) for dense, i in zip(self.hidden, inputs, strict=True)]
 
     def field(self, embedding: Embedding) -> ObjectField:
         """Folds one object's code into the two layers that see it."""
@@ -74,11 +83,15 @@ class Decoder(nn.Module):
             skip=self._fold(embedding, skip[-self.input_width :], skip_bias),
             scale=embedding.scale,
             center=embedding.center,
+            local=tuple(
+                lookup.fold(a, embedding.scale)
+                for lookup, a in zip(self.lookups, embedding.anchors, strict=True)
+            ),
         )
 
     def _fold(self, e: Embedding, kernel: Float[Array, "i h"], bias: Float[Array, " h"]) -> Affine:
         code = self.config.encoder.code
-        of_inv, of_eqv, of_length = kernel[:code], kernel[code:-1], kernel[-1:]
+        of_inv, of_eqv, of_length = kernel[:code], kernel[code : 2 * code], kernel[2 * code : 2 * code + 1]
         matrix = jnp.concatenate([self.config.eqv_gain * (e.eqv @ of_eqv), of_length])
         return matrix, self.config.inv_gain * (e.inv @ of_inv) + bias
 
@@ -89,12 +102,15 @@ class Decoder(nn.Module):
         d, kernels = self.config.decoder, self.kernels()
         q = (points - field.center) / field.scale
         length = jnp.sqrt(jnp.maximum(jnp.sum(q * q, axis=-1, keepdims=True), 1e-30))
+        local = [lookup.ask(f, q) for lookup, f in zip(self.lookups, field.local, strict=True)]
         q = jnp.concatenate([q, length], axis=-1)
-        h = self._activate(q @ field.first[0] + field.first[1], train)
+        near = jnp.concatenate([q[:, :0], *local], axis=-1)
+        first, skip = (k[len(k) - self.looked_up :] for k in (kernels[0][0], kernels[d.skip_layer][0]))
+        h = self._activate(q @ field.first[0] + field.first[1] + near @ first, train)
         for i in range(1, d.layers):
             kernel, bias = kernels[i]
             if i == d.skip_layer:
-                h = h @ kernel[: -self.input_width] + q @ field.skip[0] + field.skip[1]
+                h = h @ kernel[: -self.input_width] + q @ field.skip[0] + field.skip[1] + near @ skip
             else:
                 h = h @ kernel + bias
             h = self._activate(h, train)

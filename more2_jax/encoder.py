@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float
 
 from more2_jax.config import EncoderConfig
 from more2_jax.neighbours import over_neighbours
-from more2_jax.types import Embedding
+from more2_jax.types import Anchors, Embedding
 from more2_jax.vn import (
     TINY,
     VNLA,
@@ -150,6 +150,7 @@ class Encoder(nn.Module):
     """Φ for one cloud whose rows are in farthest-point order, so a prefix *is* the thinned cloud."""
 
     config: EncoderConfig
+    keep: tuple[int, ...] = ()  # blocks whose points and features the embedding takes along
 
     @nn.compact
     def __call__(self, points: Float[Array, "n 3"], mask: Bool[Array, "n"]) -> Embedding:
@@ -157,27 +158,30 @@ class Encoder(nn.Module):
         mean = masked_mean(points, mask)
         centred = jnp.where(mask[:, None], points - mean, 0.0)
         radius = power_of_two(jnp.sqrt(masked_mean(jnp.sum(centred**2, axis=-1), mask)))
-        features, mask = self.blocks(centred / radius, mask)
+        levels = self.blocks(centred / radius, mask)
+        features, mask = levels[-1]
         head = VNLA(c.code, c.leak, shared_direction=True, name="head")(features)
         x = masked_mean(head, mask)
         eqv = channel_normalise(x)
         turned = x @ self.param("invariant", kernel_init, (c.code, c.code))
-        offset = Center(c.code // 2, c.leak, name="center")(x)
+        offset = Center(c.code // 2, c.leak, name="center")(x) * c.output_scale * radius
         return Embedding(
             inv=jnp.sum(channel_normalise(turned) * eqv, axis=-2),
             eqv=eqv,
             scale=norm(x).mean() * c.output_scale * radius,
-            center=mean + offset * c.output_scale * radius,
+            center=mean + offset,
             origin=jnp.zeros(3, points.dtype),
+            anchors=tuple(anchors(centred - offset, *levels[i]) for i in self.keep),
         )
 
     def blocks(
         self, points: Float[Array, "n 3"], mask: Bool[Array, "n"]
-    ) -> tuple[Float[Array, "m 3 c"], Bool[Array, "m"]]:
-        """All VN blocks; thinning takes the first rows."""
+    ) -> list[tuple[Float[Array, "_ 3 _"], Bool[Array, "_"]]]:
+        """What every VN block gives, and which rows of it are real; thinning takes the first rows."""
         c = self.config
         thinning = dict(zip(c.downsample_blocks, c.downsample_factors, strict=True))
         features = FirstBlock(c, name="block_0")(points, mask)
+        levels = [(features, mask)]
         for i, width in enumerate(c.widths[1:], start=1):
             keep = len(features) // thinning.get(i, 1)
             query, query_mask = features[:keep], mask[:keep]
@@ -186,7 +190,13 @@ class Encoder(nn.Module):
             else:
                 features = AttentionBlock(c, width, name=f"block_{i}")(features, mask, query, query_mask)
             mask = query_mask
-        return features, mask
+            levels.append((features, mask))
+        return levels
+
+
+def anchors(offset: Float[Array, "n 3"], features: Float[Array, "a 3 f"], mask: Bool[Array, " a"]) -> Anchors:
+    """The first rows of the cloud, as many as there are features, each feature brought to unit norm."""
+    return Anchors(offset=offset[: len(features)], features=channel_normalise(features), mask=mask)
 
 
 def neighbour_counts(config: EncoderConfig, points: int) -> list[int]:

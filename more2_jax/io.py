@@ -8,6 +8,7 @@ the old folder or the new one, and the next save clears what lies beside it.
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import shutil
@@ -24,6 +25,7 @@ from more2_jax.config import SceneConfig, load_config, to_yaml
 from more2_jax.meshfile import read_mesh, read_points, write_mesh, write_points
 from more2_jax.report import write_report
 from more2_jax.types import (
+    Anchors,
     Changes,
     Embedding,
     LivingScene,
@@ -45,6 +47,7 @@ WRITTEN = (
     "config.yaml",
 )
 EMBEDDING = ("inv", "eqv", "scale", "center", "origin")
+ANCHORS = ("offset", "features", "mask")
 # What NumPy, zipfile, json, yaml and our own records raise for files that are damaged or missing.
 DAMAGE = (
     KeyError,
@@ -135,7 +138,7 @@ def _fill(folder: Path, scene: LivingScene, config: SceneConfig, log: str) -> No
         if o.mesh is not None:
             write_mesh(folder / _mesh_name(o), o.mesh)
     _write_background(folder / "background.ply", scene.scans)
-    stacked = {k: np.stack([np.asarray(getattr(o.embedding, k)) for o in scene.objects]) for k in EMBEDDING}
+    stacked = _stacked([o.embedding for o in scene.objects])
     ids = np.array([o.id for o in scene.objects])
     np.savez_compressed(folder / "embeddings.npz", **({"id": ids} | stacked))  # type: ignore[arg-type]
     (folder / "config.yaml").write_text(to_yaml(config), encoding="utf-8")
@@ -284,10 +287,28 @@ def _background(path: Path) -> tuple[np.ndarray, np.ndarray]:
     return read_points(path) if path.is_file() else (np.zeros((0, 3)), np.zeros(0, np.int64))
 
 
+def _stacked(embeddings: list[Embedding]) -> dict[str, np.ndarray]:
+    """One array a field, a row an object; anchors as `anchors_<level>_<field>`."""
+    if not embeddings:
+        return {k: np.zeros(0) for k in EMBEDDING}
+    stacked = {k: np.stack([np.asarray(getattr(e, k)) for e in embeddings]) for k in EMBEDDING}
+    for level, name in itertools.product(range(len(embeddings[0].anchors)), ANCHORS):
+        rows = [np.asarray(getattr(e.anchors[level], name)) for e in embeddings]
+        stacked[f"anchors_{level}_{name}"] = np.stack(rows)
+    return stacked
+
+
 def _embeddings(path: Path) -> dict[str, Embedding]:
     with np.load(path, allow_pickle=False) as file:
-        stacked = {k: file[k] for k in EMBEDDING}
-        return {str(i): Embedding(**{k: v[n] for k, v in stacked.items()}) for n, i in enumerate(file["id"])}
+        stacked = {k: file[k] for k in file.files}
+    levels = sum(k.endswith("_offset") for k in stacked)
+
+    def one(n: int) -> Embedding:
+        parts = [{k: stacked[f"anchors_{level}_{k}"][n] for k in ANCHORS} for level in range(levels)]
+        anchors = tuple(Anchors(**part) for part in parts)
+        return Embedding(**{k: stacked[k][n] for k in EMBEDDING}, anchors=anchors)
+
+    return {str(i): one(n) for n, i in enumerate(stacked["id"])}
 
 
 def _object(folder: Path, o: dict[str, Any], embedding: Embedding) -> SceneObject:

@@ -23,6 +23,25 @@ def sdf_loss(
     return jnp.mean(weight * jnp.abs(predicted - truth))
 
 
+def sign_loss(predicted: Float[Array, "*b q"], truth: Float[Array, "*b q"], width: float) -> Float[Array, ""]:
+    """Mean cross-entropy of inside or outside, the logit being −distance / `width`.
+
+    The error of a distance hardly tells the two sides of a thin board apart; this does.
+    """
+    return optax.sigmoid_binary_cross_entropy(-predicted / width, truth < 0).mean()
+
+
+def up_loss(eqv: Float[Array, "b 2 3 c"]) -> Float[Array, ""]:
+    """Mean squared distance between the mean direction of the first third of F_eqv and the shape's vertical.
+
+    Shapes are canonical, z up. Two of a rotation's three degrees of freedom then follow from semantics, which a
+    partial cloud keeps better than its moments.
+    """
+    c = eqv.shape[-1]
+    up = eqv[..., : c // 3].mean(axis=-1) * jnp.sqrt(1.0 * c)
+    return jnp.mean(jnp.sum((up - jnp.array([0.0, 0.0, 1.0])) ** 2, axis=-1))
+
+
 def contrast_loss(
     first: Float[Array, "b c"], second: Float[Array, "b c"], temperature: float
 ) -> Float[Array, ""]:
@@ -52,6 +71,8 @@ def total_loss(
         "scale": jnp.mean(jnp.abs(jnp.log(embedding.scale))),
         "contrast": contrast_loss(embedding.inv[:, 0], embedding.inv[:, 1], config.contrast_temperature),
         "turn": turn_loss(embedding.eqv),
+        "sign": sign_loss(predicted, sample.sdf, config.sign_width),
+        "up": up_loss(embedding.eqv),
     }
     weights = {
         "sdf": 1.0,
@@ -59,6 +80,8 @@ def total_loss(
         "scale": config.scale_weight,
         "contrast": config.contrast_weight,
         "turn": config.turn_weight,
+        "sign": config.sign_weight,
+        "up": config.up_weight,
     }
     return sum((weights[k] * v for k, v in terms.items()), jnp.zeros(())), terms
 

@@ -44,7 +44,7 @@ def init_prior(config: PriorConfig, key: Array, name: str = "random") -> Prior:
     encoder_key, decoder_key = jax.random.split(key)
     points = jax.random.normal(encoder_key, (e.points, 3))
     mask = jnp.ones(e.points, bool)
-    encoder, embedding = _initialise(Encoder(e), encoder_key, points, mask)
+    encoder, embedding = _initialise(Encoder(e, keep=config.decoder.local_blocks), encoder_key, points, mask)
     decoder, _ = _initialise(Decoder(config), decoder_key, embedding, points[:1])
     return Prior(params={"encoder": encoder, "decoder": decoder}, config=config, name=name)
 
@@ -56,7 +56,8 @@ def _initialise(module: Encoder | Decoder, key: Array, *inputs: Any) -> tuple[di
 
 def encode_ordered(prior: Prior, points: Float[Array, "n 3"], mask: Bool[Array, " n"]) -> Embedding:
     """Φ of one cloud already in farthest-point order; differentiable."""
-    return Encoder(prior.config.encoder).apply({"params": prior.params["encoder"]}, points, mask)  # type: ignore[return-value]
+    encoder = Encoder(prior.config.encoder, keep=prior.config.decoder.local_blocks)
+    return encoder.apply({"params": prior.params["encoder"]}, points, mask)  # type: ignore[return-value]
 
 
 def encode_one(prior: Prior, points: Float[Array, "n 3"], mask: Bool[Array, " n"]) -> Embedding:

@@ -40,6 +40,15 @@ class PointCloud:
 
 
 @pytree
+class Anchors:
+    """Points of the observed surface with the encoder's features there: what a local decoder looks up."""
+
+    offset: Float[Array, "*batch a 3"]  # metres, relative to the embedding's `center`
+    features: Float[Array, "*batch a 3 f"]  # unit norm over (3, f); columns turn with the object
+    mask: Bool[Array, "*batch a"]  # True where the anchor is real
+
+
+@pytree
 class Embedding:
     """What the encoder says of one object (paper §3.1): `Φ(sRX + t) = (inv, R·eqv, s·scale, sR·center + t)`."""
 
@@ -48,16 +57,20 @@ class Embedding:
     scale: Float[Array, "*batch"]  # F_s, metres per canonical unit
     center: Float[Array, "*batch 3"]  # F_c, metres, relative to `origin`
     origin: Float[Array | np.ndarray, "*batch 3"]  # metres, in the scan's frame
+    anchors: tuple[Anchors, ...] = ()  # a level each; none where the decoder reads the four codes alone
 
 
 def scale_embedding(e: Embedding, factor: Float[Array, ""]) -> Embedding:
-    """The embedding of the same object in other units of length."""
-    return dataclasses.replace(e, scale=e.scale * factor, center=e.center * factor)
+    """The embedding of the same object in other units of length. One object."""
+    anchors = tuple(dataclasses.replace(a, offset=a.offset * factor) for a in e.anchors)
+    return dataclasses.replace(e, scale=e.scale * factor, center=e.center * factor, anchors=anchors)
 
 
 def move_embedding(e: Embedding, T_b_a: jaxlie.SE3) -> Embedding:
     """The embedding of a moved object: Φ is equivariant, so nothing is encoded again. One object; local frames."""
-    return dataclasses.replace(e, eqv=T_b_a.rotation().as_matrix() @ e.eqv, center=T_b_a @ e.center)
+    R = T_b_a.rotation().as_matrix()
+    anchors = tuple(dataclasses.replace(a, offset=a.offset @ R.T, features=R @ a.features) for a in e.anchors)
+    return dataclasses.replace(e, eqv=R @ e.eqv, center=T_b_a @ e.center, anchors=anchors)
 
 
 @pytree

@@ -1,5 +1,6 @@
 """Ψ: the folded affine form is the plain one, smooth enough to descend, random only while training."""
 
+import dataclasses
 from pathlib import Path
 
 import jax
@@ -47,9 +48,13 @@ def plain(prior, e: Embedding, points: np.ndarray) -> np.ndarray:
     return np.tanh(h @ last["kernel"] + last["bias"])[:, 0]
 
 
-@pytest.fixture(scope="module", params=["tiny", "small"])
+@pytest.fixture(scope="module", params=["tiny", "base", "wide"])
 def prior(request):
-    return init_prior(load_config(CONFIGS / f"{request.param}.yaml", TrainingRun).model, jax.random.key(2))
+    name = "tiny" if request.param == "wide" else request.param
+    model = load_config(CONFIGS / f"{name}.yaml", TrainingRun).model
+    if request.param == "wide":
+        model = dataclasses.replace(model, decoder=dataclasses.replace(model.decoder, narrow_skip=False))
+    return init_prior(model, jax.random.key(2))
 
 
 def test_folded_form_equals_the_plain_form(prior):

@@ -15,7 +15,7 @@ from places import ROOT
 from more2_jax.config import TrainingRun, load_config, to_yaml
 from more2_jax.data.sampling import sample_batch
 from more2_jax.data.shards import load_shapes
-from more2_jax.losses import contrast_loss, sdf_loss, total_loss, turn_loss
+from more2_jax.losses import contrast_loss, sdf_loss, sign_loss, total_loss, turn_loss, up_loss
 from more2_jax.prior import load_prior
 from train.prior import main
 
@@ -66,6 +66,20 @@ def test_turn_loss_is_zero_for_equal_vectors_and_two_for_orthogonal_ones():
     second = jnp.zeros((1, 3, 4)).at[0, 1, 0].set(1.0)
     assert turn_loss(jnp.stack([first, first], axis=1)) == 0
     np.testing.assert_allclose(turn_loss(jnp.stack([first, second], axis=1)), 2.0)
+
+
+def test_sign_loss_is_that_of_a_coin_at_zero_and_none_when_sure():
+    truth = jnp.array([0.2, -0.2])
+    np.testing.assert_allclose(sign_loss(jnp.zeros(2), truth, 0.01), np.log(2), rtol=1e-6)
+    assert sign_loss(truth, truth, 0.01) < 1e-6
+    np.testing.assert_allclose(sign_loss(-truth, truth, 0.01), 20.0, rtol=1e-4)
+
+
+def test_up_loss_is_zero_where_the_first_third_points_up_and_one_where_it_says_nothing():
+    up = jnp.zeros((1, 2, 3, 6)).at[..., 2, :2].set(6**-0.5)
+    np.testing.assert_allclose(up_loss(up), 0.0, atol=1e-12)
+    np.testing.assert_allclose(up_loss(-up), 4.0, rtol=1e-6)
+    np.testing.assert_allclose(up_loss(jnp.zeros((1, 2, 3, 6))), 1.0)
 
 
 def test_gradients_of_the_training_loss_are_finite(shards, run, tiny_prior):

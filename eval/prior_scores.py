@@ -1,0 +1,237 @@
+"""What a prior knows of shapes from sources that no training used: sign, overlap, orientation, identity.
+
+`python -m eval.prior_scores --prior small --shards data/shards --out runs/prior_scores`
+
+Every shape is seen twice, each time from other viewpoints, with noise and in a random orientation. Nothing but the
+codes decides: no other starts, no geometry, no size.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jaxtyping import Bool, Float
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+from scipy.spatial.transform import Rotation
+
+from more2_jax.config import MatchingConfig
+from more2_jax.data.flying_shape import yaw_symmetry
+from more2_jax.data.shards import ShardView, open_shards, read_solids, shard_folders
+from more2_jax.geometry import farthest_points, kabsch_rotation
+from more2_jax.matching import hungarian, score_matrix
+from more2_jax.metrics import bootstrap_ci95, symmetry_aware_rotation_error_deg
+from more2_jax.prior import Prior, encode_ordered, field_sdf, load_prior, object_field
+from more2_jax.types import Embedding
+from train.program import run
+
+BATCH = 8
+RIGHT_DEG = 10.0
+NEAR = 4096  # queries near the surface, for the sign
+VERTICAL = np.array([0.0, 0.0, 1.0])
+
+
+@dataclass(frozen=True)
+class Row:
+    """Scores of one shape, seen twice."""
+
+    category: str
+    near_sign: float
+    iou: float
+    rotation_deg: float
+
+
+def main(
+    shards: tuple[Path, ...],
+    out: Path,
+    prior: str = "small",
+    split: str = "test",
+    views: tuple[int, ...] = (3, 2, 1),
+    points: int = 50_000,
+    noise: float = 0.005,
+    scenes: int = 400,
+    most: int | None = None,
+    seed: int = 0,
+) -> None:
+    """Scores a prior on every shape of a split.
+
+    Args:
+        shards: folders that `python -m train.prepare` wrote.
+        out: folder for results.json.
+        prior: name of shipped weights, or a file.
+        split: `test` for the final figure; `val` while choosing.
+        views: numbers of depth images that a cloud is merged from.
+        points: uniform in the unit cube, for the intersection over union.
+        noise: standard deviation of every coordinate, canonical units.
+        scenes: of 4 to 8 shapes, for matching.
+        most: score no more shapes than this.
+        seed: of viewpoints, noise, orientations and scenes.
+    """
+    weights, shapes = load_prior(prior), open_shards(shards, split)
+    count = min(len(shapes), most or len(shapes))
+    names = [m["name"] for m in shapes.meta[:count]]
+    symmetry = symmetries(shards, frozenset(names))
+    orders = [symmetry[name] for name in names]
+    results: dict[str, Any] = {"prior": weights.name, "split": split, "shapes": count}
+    for number in views:
+        rows, codes = score_shapes(weights, shapes, orders, count, number, points, noise, seed)
+        results[f"{number} views"] = summary(rows) | {"instance recall": matching(codes, scenes, seed)}
+    out.mkdir(parents=True, exist_ok=True)
+    (out / "results.json").write_text(json.dumps(results, indent=1))
+    Console().print(table(results))
+
+
+def symmetries(folders: Sequence[Path], names: frozenset[str]) -> dict[str, int]:
+    """Order of the symmetry about the vertical of the shapes called `names` (see `yaw_symmetry`)."""
+    every = (s for folder in folders for shard in shard_folders(folder) for s in read_solids(shard))
+    solids = [s for s in every if s.name in names]
+    return {s.name: yaw_symmetry(s.vertices, s.faces) for s in track(solids, description="symmetries")}
+
+
+def score_shapes(
+    prior: Prior,
+    shapes: ShardView,
+    orders: Sequence[int],
+    count: int,
+    views: int,
+    points: int,
+    noise: float,
+    seed: int,
+) -> tuple[list[Row], Embedding]:
+    """A row a shape, and the codes of both clouds (shapes, 2, …)."""
+    rows, codes = [], []
+    for start in track(range(0, count, BATCH), description=f"{views} views"):
+        index = [min(k, count - 1) for k in range(start, start + BATCH)]  # fillers repeat the last
+        seen = [
+            see_twice(shapes[k], views, points, noise, np.random.default_rng((seed, views, k))) for k in index
+        ]
+        embedding, sign, iou, turn = jax.device_get(
+            score_batch(prior, *(np.stack([s[name] for s in seen]) for name in SEEN))
+        )
+        codes.append(embedding)
+        for k, n in enumerate(index[: count - start]):
+            error = rotation_error(turn[k], seen[k]["rotation"], orders[n])
+            rows.append(Row(shapes.meta[n]["category"], float(sign[k]), float(iou[k]), error))
+    return rows, jax.tree.map(lambda *x: np.concatenate(x)[:count], *codes)
+
+
+SEEN = ("clouds", "near", "uniform")
+
+
+def see_twice(
+    shape: Mapping[str, np.ndarray], views: int, points: int, noise: float, rng: np.random.Generator
+) -> dict[str, np.ndarray]:
+    """Two clouds in random orientations; queries and true distances in the first one's frame."""
+    rotation = Rotation.from_quat(rng.normal(size=(2, 4))).as_matrix()
+    clouds = []
+    for R in rotation:
+        chosen = rng.choice(len(shape["views"]), views, replace=False)
+        merged = np.asarray(shape["views"][chosen], np.float64).reshape(-1, 3)
+        clouds.append((rng.permutation(merged) + noise * rng.normal(size=merged.shape)) @ R.T)
+    known = {"near": shape["sdf_near"][:NEAR], "uniform": shape["sdf_uniform"][:points]}
+    turned = {
+        k: np.concatenate([v[:, :3].astype(np.float64) @ rotation[0].T, v[:, 3:]], axis=1)
+        for k, v in known.items()
+    }
+    return {"clouds": np.stack(clouds), "rotation": rotation} | turned
+
+
+@jax.jit
+def score_batch(
+    prior: Prior,
+    clouds: Float[Array, "b 2 n 3"],
+    near: Float[Array, "b q 4"],
+    uniform: Float[Array, "b u 4"],
+) -> tuple[Embedding, Float[Array, " b"], Float[Array, " b"], Float[Array, "b 3 3"]]:
+    """Codes, share of right signs, intersection over union, and the rotation between the clouds (Kabsch)."""
+
+    def encode(points: Float[Array, "n 3"]) -> Embedding:
+        real = jnp.ones(len(points), bool)
+        return encode_ordered(prior, *farthest_points(points, real, prior.config.encoder.points))
+
+    def one(pair: Array, near: Array, uniform: Array) -> tuple[Embedding, Array, Array, Array]:
+        codes = jax.vmap(encode)(pair)
+        field = object_field(prior, jax.tree.map(lambda x: x[0], codes))
+        right = (field_sdf(prior, field, near[:, :3]) < 0) == (near[:, 3] < 0)
+        inside, truth = field_sdf(prior, field, uniform[:, :3]) < 0, uniform[:, 3] < 0
+        union = jnp.maximum((inside | truth).sum(), 1)
+        turn = kabsch_rotation(codes.eqv[0].T, codes.eqv[1].T).as_matrix()
+        return codes, right.mean(), (inside & truth).sum() / union, turn
+
+    # One after the other: fifty thousand queries of one shape fill the processor.
+    return jax.lax.map(lambda x: one(*x), (clouds, near, uniform))
+
+
+def rotation_error(R: np.ndarray, true: Float[np.ndarray, "2 3 3"], order: int) -> float:
+    """Degrees between the rotation found and the true one, up to the shape's symmetry about its vertical."""
+    return symmetry_aware_rotation_error_deg(R, true[1] @ true[0].T, true[0] @ VERTICAL, order)
+
+
+@partial(jax.jit, static_argnames="config")
+def matched(codes: Embedding, real: Bool[Array, " n"], config: MatchingConfig) -> Bool[Array, " n"]:
+    """Which of a scene's objects the assignment on H = Λ ⊘ E takes to themselves."""
+    source, target = (jax.tree.map(lambda x, i=i: x[:, i], codes) for i in (0, 1))
+    partner, _ = hungarian(score_matrix(source, target, config), real[:, None] & real[None])
+    return (partner == jnp.arange(len(real))) & real
+
+
+def matching(codes: Embedding, scenes: int, seed: int) -> dict[str, Any]:
+    """Instance recall over scenes of 4 to 8 shapes; every object has its partner."""
+    rng, right, of = np.random.default_rng(seed), [], []
+    for _ in range(scenes):
+        chosen = rng.choice(len(codes.scale), 8, replace=False)
+        real = np.arange(8) < rng.integers(4, 9)
+        scene = jax.tree.map(lambda x, c=chosen: x[c], codes)
+        right.append(int(np.sum(matched(scene, real, MatchingConfig()))))
+        of.append(int(real.sum()))
+    share = np.array(right) / np.array(of)
+    return figure(share, np.sum(right) / np.sum(of))
+
+
+def summary(rows: Sequence[Row]) -> dict[str, Any]:
+    """Means with their intervals, and the same by category."""
+    values = {
+        "near-surface sign": np.array([r.near_sign for r in rows]),
+        "IoU": np.array([r.iou for r in rows]),
+        "Kabsch, RE < 10°": np.array([r.rotation_deg < RIGHT_DEG for r in rows], float),
+    }
+    kinds = np.array([r.category for r in rows])
+    by_kind = {
+        kind: {name: round(float(v[kinds == kind].mean()), 4) for name, v in values.items()}
+        | {"count": int((kinds == kind).sum())}
+        for kind in sorted(set(kinds))
+    }
+    middle = float(np.median([r.rotation_deg for r in rows]))
+    return {k: figure(v, float(v.mean())) for k, v in values.items()} | {
+        "Kabsch, median RE (deg)": {"value": middle, "count": len(rows)},
+        "by category": by_kind,
+    }
+
+
+def figure(values: Float[np.ndarray, " n"], value: float) -> dict[str, Any]:
+    """One figure with its 95 % interval."""
+    return {"value": float(value), "ci95": list(bootstrap_ci95(values)), "count": len(values)}
+
+
+def table(results: dict[str, Any]) -> Table:
+    """A row a figure, a column a number of views."""
+    columns = [k for k in results if k.endswith(" views")]
+    shown = Table("figure", *columns)
+    for name in results[columns[0]]:
+        if name != "by category":
+            shown.add_row(name, *(f"{results[c][name]['value']:.3f}" for c in columns))
+    return shown
+
+
+if __name__ == "__main__":
+    run(main)
