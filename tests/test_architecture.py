@@ -16,7 +16,17 @@ LONGEST_FILE, LONGEST_FUNCTION = 400, 40  # lines
 LAYERS = {
     "types": ("types", "config", "progress"),
     "tools": ("geometry", "batching", "descent", "metrics", "meshfile", "data"),
-    "network": ("vn", "neighbours", "encoder", "decoder", "prior", "losses", "published", "checkpoint"),
+    "network": (
+        "vn",
+        "neighbours",
+        "encoder",
+        "local_field",
+        "decoder",
+        "prior",
+        "losses",
+        "published",
+        "checkpoint",
+    ),
     "stages": ("starts", "matching", "registration", "meshing", "joint"),
     "scene": ("objects", "encoding", "tracking", "fitting", "scene"),
     "programs": ("io", "report", "export", "demo", "commands", "cli", "train", "eval"),
