@@ -41,11 +41,10 @@ def draw_ecdf(
     figure, axes = pyplot().subplots(figsize=(5, 3.6))
     for name in dict.fromkeys(str(r[by]) for r in records if key in r):
         own = [r[key] for r in records if str(r[by]) == name and key in r]
-        values, share = ecdf([v for v in own if v is not None])
-        found = len(values) / len(own)
-        axes.step(
-            [0, *values, limit], [0, *(share * found), found], where="post", label=f"{name} ({len(own)})"
-        )
+        values, _ = ecdf([v for v in own if v is not None and v <= limit])
+        share = np.arange(len(values) + 1) / len(own)  # of all, also those that failed or lie beyond
+        steps = np.append(share, share[-1])
+        axes.step([0, *values, limit], steps, where="post", label=f"{name} ({len(own)})")
     axes.set(xlabel=label, ylabel="share", xlim=(0, limit), ylim=(0, 1))
     axes.grid(alpha=0.3)
     axes.legend(fontsize=7)

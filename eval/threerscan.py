@@ -16,8 +16,9 @@ from eval.symmetry import SymmetryGroup
 from eval.truth import Benchmark, KnownObject, KnownScene
 from more2_jax.data.scans import read_scan
 from more2_jax.data.threerscan_index import CATEGORIES, SYMMETRY_FOLDS, Place, Rescan, read_index
+from more2_jax.meshfile import read_mesh
 from more2_jax.metrics import apply_pose, rotation_error_deg
-from more2_jax.types import Scan
+from more2_jax.types import Mesh, Scan
 
 RIGHT_DEG = 10.0
 MOVED_DEG, MOVED_M = 1.0, 0.05  # beyond either, an object moved (published evaluation)
@@ -49,9 +50,20 @@ def read_place(data: Path, place: Place, *, predicted: bool = False) -> KnownSce
     folders = [data / name for name in (place.reference, *(r.id for r in place.rescans))]
     scans = [movable(folder) for folder in folders]
     labels = [{i.id: i.label or "" for i in scan.instances} for scan in scans]
-    objects = tuple(_object(place, i, labels, scans[0]) for i in sorted(labels[0]))
+    objects = tuple(_object(data, place, i, labels, scans[0]) for i in sorted(labels[0]))
     scene = KnownScene(name=place.reference, scans=tuple(scans), objects=objects)
     return associated(scene, [read_predicted(folder) for folder in folders]) if predicted else scene
+
+
+def true_mesh(data: Path, place: Place, id_: int, T_ref_model: np.ndarray) -> Mesh | None:
+    """The object's annotated surface, in its model frame, where the data have it: the published evaluation's files."""
+    file = data.parent / "val_set_recon" / place.reference / f"objectId_{id_}.ply"
+    if not file.is_file():
+        return None
+    mesh = read_mesh(file)
+    return Mesh(
+        vertices=apply_pose(np.linalg.inv(T_ref_model), mesh.vertices), faces=mesh.faces.astype(np.int64)
+    )
 
 
 def movable(folder: Path) -> Scan:
@@ -70,7 +82,7 @@ def read_predicted(folder: Path) -> Scan:
     return read_scan(folder, min_points=1, masks=masks)
 
 
-def _object(place: Place, id_: int, labels: list[dict[int, str]], reference: Scan) -> KnownObject:
+def _object(data: Path, place: Place, id_: int, labels: list[dict[int, str]], reference: Scan) -> KnownObject:
     """An object of the reference, with what is annotated of it in every rescan."""
     root, T_ref_model = _model_frame(place, id_)
     poses, instance, moved = {0: T_ref_model}, {0: id_}, {0: False}
@@ -90,6 +102,7 @@ def _object(place: Place, id_: int, labels: list[dict[int, str]], reference: Sca
         copies=f"instance_{root}",
         instance=instance,
         T_scan_model=poses,
+        mesh=true_mesh(data, place, id_, T_ref_model),
         symmetry=SymmetryGroup.turns(SYMMETRY_FOLDS.get(symmetry, 1), center),
         forgiven_deg=FORGIVEN_DEG.get(symmetry, ()),
         moved=moved,

@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+import trimesh
 from dataset_writers.threerscan import column_major, write_annotated_mesh, write_semseg
 from known_scenes import known_scene, pose
 
@@ -13,6 +14,8 @@ from eval.match_scores import match_scores
 from eval.options import Options, benchmark, is_upright
 from eval.pose_scores import pose_scores
 from eval.threerscan import threerscan
+from more2_jax.meshfile import write_mesh
+from more2_jax.types import Mesh
 
 SCENE = known_scene(points=128)
 
@@ -110,7 +113,11 @@ def write_scan(folder, poses):
 
 @pytest.fixture(scope="module")
 def places(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("3rscan")
+    folder = tmp_path_factory.mktemp("data") / "3rscan"
+    recon = folder.parent / "val_set_recon" / "ref"
+    recon.mkdir(parents=True)
+    box = trimesh.creation.box((0.8, 0.8, 0.8), transform=T_REF[2])
+    write_mesh(recon / "objectId_2.ply", Mesh(vertices=np.asarray(box.vertices), faces=np.asarray(box.faces)))
     for name, poses in (("ref", T_REF), ("later", T_RESCAN)):
         ids = write_scan(folder / name, poses)
         predicted = np.where(ids == 3, 0, ids)  # the network misses the table
@@ -160,6 +167,13 @@ def test_annotated_places(places):
     assert one.forgiven_deg == (180.0,) and len(one.symmetry.rotations) == 2 and table.forgiven_deg == ()
     swapped = match_scores(scene, 0, 1, {1: 2, 2: 1, 3: 3})
     assert (swapped["right.paper"], swapped["right.published"], swapped["right.strict"]) == (1, 3, 3)
+
+
+def test_annotated_surfaces_stand_where_the_points_are(places):
+    one, two, _ = threerscan(places, split="validation", predicted=False).read("ref").objects
+    assert one.mesh is None and two.mesh is not None
+    in_reference = two.mesh.vertices @ two.T_scan_model[0][:3, :3].T + two.T_scan_model[0][:3, 3]
+    np.testing.assert_allclose(in_reference.mean(axis=0), T_REF[2][:3, 3], atol=1e-6)
 
 
 def test_predicted_masks_show_the_objects_they_overlap_most(places):
