@@ -13,6 +13,7 @@ from typing import Any
 
 from eval.figures import Row
 from eval.paper_numbers import quoted
+from eval.results import portable
 from eval.tables import best, heading, markdown_table, number
 from train.program import run
 
@@ -36,6 +37,7 @@ scenes; "of" is the denominator; a failure counts in it. Bold is best of its lin
 
 - *paper's formula*: as printed. *as published*: as the published code computes it. *strict*: rotations over the
   object's own measured symmetry group, copies interchangeable once each, distances in centimetres.
+- A line without one of these names is the same in all columns that differ elsewhere, or has no other form.
 - What the paper prints is quoted below our tables. Its data, weights and some of its definitions are others: **the two
   may not be compared**.
 """
@@ -130,10 +132,9 @@ def circumstances(result: Result) -> str:
     """Command, weights, machine and date."""
     c = result.content
     s, versions = c["settings"], ", ".join(f"{k} {v}" for k, v in c["versions"].items() if v)
-    return (
-        f"`{c['command']}`; weights {s['prior']} ({s['weights']}), data {s['data']['digest']}; {c['hardware']};"
-        f" {versions}; {c['date'][:10]}"
-    )
+    command, digest = portable(c["command"].split()), s["data"]["digest"]
+    what = f"`{command}`; weights {s['prior']} ({s['weights']}), data {digest}"
+    return f"{what}; {c['hardware']}; {versions}; {c['date'][:10]}"
 
 
 def by_group(result: Result, prefix: str) -> str | None:

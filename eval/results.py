@@ -7,6 +7,7 @@ import importlib.metadata
 import sys
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -44,13 +45,18 @@ def finish(
 def provenance(run: Run, o: Options) -> dict[str, Any]:
     """Command, data, settings, hardware, versions: what a figure belongs to."""
     return {
-        "command": " ".join(["python", "-m", f"eval.{run.settings['program']}", *sys.argv[1:]]),
+        "command": portable(["python", "-m", f"eval.{run.settings['program']}", *sys.argv[1:]]),
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
         "hardware": hardware(),
         "versions": {p: _version(p) for p in ("jax", "open3d-cpu", "small-gicp", "kiss-matcher")},
         "scenes_asked": o.scenes or len(run.data.names),
         "settings": run.settings,
     }
+
+
+def portable(words: Sequence[str]) -> str:
+    """A command with the last part alone of every absolute path: others keep their files elsewhere."""
+    return " ".join(Path(w).name if w.startswith("/") else w for w in words)
 
 
 def _version(package: str) -> str | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 
 from rich.box import SIMPLE
 from rich.markup import escape
@@ -23,7 +24,7 @@ def number(value: float | None) -> str:
     """Three significant digits; a dash where more than half are failures or nothing has a value."""
     if value is None:
         return "–"
-    return f"{value:.0f}" if abs(value) >= 1000 else f"{value:.3g}" if abs(value) < 100 else f"{value:.1f}"
+    return f"{value:.0f}" if abs(value) >= 99.95 else f"{value:.3g}"
 
 
 def cell(row: Row | None) -> str:
@@ -63,7 +64,25 @@ def grid(rows: Sequence[Row]) -> tuple[list[str], list[list[str]], list[list[boo
         counts = sorted({r.count for r in line if r is not None})
         text.append([name, "/".join(map(str, counts)), *(cell(r) for r in line)])
         bold.append([False, False, *(id(r) in top for r in line)])
+    text, bold = without_repeats(rows, text, bold)
     return ["figure", "of", *methods], text, bold
+
+
+def without_repeats(
+    rows: Sequence[Row], text: list[list[str]], bold: list[list[bool]]
+) -> tuple[list[list[str]], list[list[bool]]]:
+    """One line, without a column's name, for a figure whose every column says the same."""
+    plain = {heading(r): heading(replace(r, column="")) for r in rows}
+    alike: dict[str, list[int]] = {}
+    for k, line in enumerate(text):
+        alike.setdefault(plain[line[0]], []).append(k)
+    kept_text, kept_bold = [], []
+    for name, lines in alike.items():
+        same = len(lines) > 1 and all(text[k][1:] == text[lines[0]][1:] for k in lines)
+        for k in lines[:1] if same else lines:
+            kept_text.append([name, *text[k][1:]] if same else text[k])
+            kept_bold.append(bold[k])
+    return kept_text, kept_bold
 
 
 def markdown(rows: Sequence[Row], title: str) -> str:

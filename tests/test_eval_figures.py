@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from eval.figures import Figure, figure_row, rows_of
-from eval.tables import best, latex, markdown, number
+from eval.figures import Figure, figure_row, in_columns, rows_of
+from eval.tables import best, latex, markdown, markdown_table, number
 
 A = {"one": [{"method": "m", "e": 1.0}, {"method": "m", "e": 9.0}], "two": [{"method": "m", "e": None}]}
 
@@ -123,7 +123,15 @@ def test_tables_show_value_interval_failures_and_the_best_in_bold():
 
 @pytest.mark.parametrize(
     ("value", "text"),
-    [(None, "–"), (0.0, "0"), (0.01234, "0.0123"), (99.44, "99.4"), (100.0, "100.0"), (4321, "4321")],
+    [(None, "–"), (0.0, "0"), (0.01234, "0.0123"), (99.44, "99.4"), (100.0, "100"), (4321, "4321")],
 )
 def test_numbers(value, text):
     assert number(value) == text
+
+
+def test_columns_that_say_the_same_share_a_line():
+    one = {"s": [{"method": "m", "e.paper": 1.0, "e.published": 1.0, "e.strict": 1.0}]}
+    other = {"s": [{"method": "m", "e.paper": 1.0, "e.published": 1.0, "e.strict": 2.0}]}
+    both = [rows_of(in_columns(figure("mean")), records) for records in (one, other)]
+    assert [len(markdown_table(rows).splitlines()) - 2 for rows in both] == [1, 3]
+    assert "| f | 1 | 1 |" in markdown_table(both[0]) and "| f, strict | 1 | 2 |" in markdown_table(both[1])
