@@ -146,6 +146,7 @@ class TrainingConfig:
     batch: int = 64  # shapes; two partial clouds each
     learning_rate: float = 1e-4
     warmup_steps: int = 200
+    schedule: Literal["cosine", "steps"] = "cosine"  # or ×0.3 at 60, 75 and 90 % of the steps, as published
     clip: float = 1.0
     ema: float = 0.999
     queries: int = 1024  # a cloud: half uniform, half near the surface
@@ -172,6 +173,7 @@ class TrainingConfig:
     sign_width: float = 0.01  # canonical units: where its sigmoid has half of its height
     up_weight: float = 0.0  # the first third of F_eqv should point up
     validate_every: int = 250
+    picture_every: int = 1000  # steps; drawn at the next validation
     seed: int = 0
 
 

@@ -3,41 +3,29 @@
 from __future__ import annotations
 
 import dataclasses
-import json
-import shutil
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from places import ROOT
+from sphere_shards import sphere_shards
 
-from more2_jax.config import TrainingRun, load_config, to_yaml
+from more2_jax.config import TrainingRun, load_config
 from more2_jax.data.sampling import sample_batch
 from more2_jax.data.shards import load_shapes
 from more2_jax.losses import contrast_loss, sdf_loss, sign_loss, total_loss, turn_loss, up_loss
-from more2_jax.prior import load_prior
-from train.prior import main
+from train import pack
+from train.journal import Journal, read_log
+from train.packed_shapes import read_shapes
+from train.pictures import EYE, splat
+from train.schedule import learning_rate
+from train.shape_mix import load_mix
 
 
 @pytest.fixture(scope="module")
 def shards(tmp_path_factory):
-    """Spheres of several sizes, in the layout of training shards."""
-    folder, rng = tmp_path_factory.mktemp("shards"), np.random.default_rng(0)
-    radius = rng.uniform(0.2, 0.45, 40)
-    unit = rng.normal(size=(40, 4, 64, 3))
-    unit /= np.linalg.norm(unit, axis=-1, keepdims=True)
-    queries = rng.uniform(-0.55, 0.55, (40, 200, 3))
-    distance = np.linalg.norm(queries, axis=-1) - radius[:, None]
-    sdf = np.concatenate([queries, distance[..., None]], axis=-1).astype(np.float16)
-    arrays = {"views": unit * radius[:, None, None, None], "sdf_uniform": sdf, "sdf_near": sdf}
-    shard = folder / "shard_000"
-    shard.mkdir()
-    for name, array in arrays.items():
-        np.save(shard / f"{name}.npy", array.astype(np.float16))
-    meta = [{"name": f"sphere_{k}", "split": "val" if k % 5 == 0 else "train"} for k in range(40)]
-    (shard / "meta.json").write_text(json.dumps(meta))
-    return folder
+    return sphere_shards(tmp_path_factory.mktemp("shards"))
 
 
 @pytest.fixture(scope="module")
@@ -94,26 +82,67 @@ def test_gradients_of_the_training_loss_are_finite(shards, run, tiny_prior):
     assert any(float(jnp.abs(g).max()) > 0 for g in jax.tree.leaves(gradient))
 
 
-@pytest.mark.slow
-def test_a_resumed_run_equals_one_that_was_not_stopped(shards, run, tmp_path):
-    long = tmp_path / "long.yaml"
-    training = dataclasses.replace(run.training, steps=8, validate_every=4)
-    long.write_text(to_yaml(dataclasses.replace(run, training=training)))
-    main(long, (shards,), tmp_path / "whole", name="sphere")
-    # Stopped at its first checkpoint, as a killed run would leave it: the second is taken away.
-    main(long, (shards,), tmp_path / "parts", name="sphere")
-    shutil.rmtree(tmp_path / "parts" / "checkpoints" / "8")
-    main(long, (shards,), tmp_path / "parts", name="sphere")
-    whole, parts = (load_prior(tmp_path / k / "weights.npz") for k in ("whole", "parts"))
-    for a, b in zip(jax.tree.leaves(whole.params), jax.tree.leaves(parts.params), strict=True):
-        np.testing.assert_array_equal(a, b)
-    lines = [json.loads(line) for line in (tmp_path / "whole" / "log.jsonl").read_text().splitlines()]
-    assert [line["step"] for line in lines] == [4, 8]
-    assert all(np.isfinite(v) for line in lines for v in line["val"].values())
+def test_the_published_schedule_drops_thrice_and_the_cosine_ends_at_a_hundredth(run):
+    training = dataclasses.replace(run.training, steps=1000, warmup_steps=100, learning_rate=1.0)
+    steps = learning_rate(dataclasses.replace(training, schedule="steps"))
+    at = [float(steps(n)) for n in (0, 50, 100, 598, 602, 752, 902, 999)]
+    np.testing.assert_allclose(at, [0, 0.5, 1, 1, 0.3, 0.09, 0.027, 0.027], rtol=1e-5)
+    cosine = learning_rate(training)
+    np.testing.assert_allclose([float(cosine(n)) for n in (0, 100, 1000)], [0, 1, 0.01], rtol=1e-5)
 
 
-def test_a_run_without_shards_says_so(run, tmp_path):
-    config = tmp_path / "c.yaml"
-    config.write_text(to_yaml(run))
-    with pytest.raises(ValueError, match="no shards"):
-        main(config, (tmp_path,), tmp_path / "out")
+def test_packed_shapes_are_the_shards_to_within_a_step(shards, tmp_path):
+    packed = tmp_path / "small.npz"
+    pack.main((shards,), packed, shapes=10, val=4, views=2, points=32, queries=50)
+    small, whole = read_shapes(packed, "train"), load_shapes(shards, "train")
+    assert small.views.shape == (10, 2, 32, 3) and small.sdf_near.shape == (10, 50, 4)
+    # Every packed shape is one of the shards', cut and rounded.
+    cut = np.asarray(whole.views[:, :2, :32], np.float64)
+    off = np.abs(cut[None] - np.asarray(small.views, np.float64)[:, None]).max(axis=(2, 3, 4))
+    assert (off.min(axis=1) < 0.0035).all() and (np.sort(off, axis=1)[:, 1] > 0.0035).all()
+    source = off.argmin(axis=1)
+    np.testing.assert_allclose(
+        np.asarray(whole.sdf_near[source, :50], np.float64), np.asarray(small.sdf_near, np.float64), atol=6e-4
+    )
+    with pytest.raises(ValueError, match="no test/views"):
+        read_shapes(packed, "test")
+
+
+@pytest.mark.parametrize("damage", [b"", b"PK\x03\x04 and no more"])
+def test_a_damaged_pack_is_refused_in_one_line(tmp_path, damage):
+    (tmp_path / "bad.npz").write_bytes(damage)
+    with pytest.raises(ValueError, match="not a readable"):
+        read_shapes(tmp_path / "bad.npz", "train")
+
+
+def test_a_source_named_twice_is_held_once_and_drawn_twice_as_often(shards, tmp_path):
+    packed = tmp_path / "small.npz"
+    pack.main((shards,), packed, shapes=5, val=2, views=4, points=64, queries=30)
+    shapes, rows = load_mix((shards, packed, shards), "train")
+    assert len(shapes.views) == 32 + 5 and shapes.sdf_near.shape[1] == 30
+    assert sorted(np.bincount(rows)) == [1] * 5 + [2] * 32
+    pack.main((shards,), packed, shapes=5, val=2, views=3, points=64, queries=30)
+    with pytest.raises(ValueError, match="views and points a shape differ"):
+        load_mix((shards, packed), "train")
+
+
+def test_a_resumed_log_forgets_what_was_lost_and_what_was_half_written(tmp_path):
+    with Journal(tmp_path, 0) as journal:
+        for step, score in ((10, 0.5), (20, 0.9), (30, 0.7)):
+            journal.write(step, float(step), {"sdf": 0.1}, {"score": score})
+    log = tmp_path / "log.jsonl"
+    log.write_text(log.read_text() + '{"step": 40, "sec')
+    with Journal(tmp_path, 10) as journal:
+        assert (journal.best, journal.seconds) == (0.5, 10.0)
+        journal.write(20, 21.0, {"sdf": 0.1}, {"score": 0.6})
+    assert [line["step"] for line in read_log(log)] == [10, 20]
+    assert Journal(tmp_path, 20).best == 0.6
+
+
+def test_nearer_points_hide_farther_ones():
+    near, far = EYE[2] * 0.3, -EYE[2] * 0.3
+    both = [splat(np.array(p), None, 1) for p in ([near, far], [far, near])]
+    np.testing.assert_array_equal(both[0], both[1])
+    np.testing.assert_array_equal(both[0], splat(near[None], None, 1))
+    # What lies outside of the picture is left out.
+    assert (splat(np.array([[50.0, 0, 0]]), None, 1) == 255).all()

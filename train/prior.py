@@ -1,14 +1,16 @@
 """Trains the prior: `python -m train.prior --config configs/small.yaml --shards data/shards --out runs/small`.
 
-Resumes from the newest checkpoint in `--out`; stops after `--minutes`, leaving checkpoint and weights.
+Resumes from the newest checkpoint in `--out`, as if it had never stopped; ends after `--minutes`, leaving
+checkpoint and weights. Runs on all devices; on several hosts, started once on each with `--coordinator`.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import json
 import math
 import time
+from contextlib import nullcontext
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -16,157 +18,182 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 import orbax.checkpoint as ocp
 from jax import Array
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from jax.sharding import Mesh
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
 from more2_jax.config import PriorConfig, TrainingConfig, TrainingRun, load_config
 from more2_jax.data.sampling import sample_batch
-from more2_jax.data.shards import Shapes, load_shapes
-from more2_jax.losses import total_loss
+from more2_jax.data.shards import Shapes
 from more2_jax.prior import Prior, encode_ordered, init_prior, save_prior
-from more2_jax.types import pytree
+from train.checkpoints import keep, open_checkpoints, resume
+from train.devices import agreed, connect, device_mesh, everywhere, here, is_first
+from train.journal import Journal
+from train.pictures import held_out
 from train.program import run
-from train.validation import validate
+from train.shape_mix import load_mix
+from train.state import TrainingState, initial_state, training_step
+from train.validation import total_score, validate
+
+IN_PICTURE = 6  # held-out shapes
 
 
-@pytree
-class TrainingState:
-    """Everything that a checkpoint holds."""
+@dataclass(frozen=True, kw_only=True)
+class Setting:
+    """What stays the same over a run."""
 
-    params: dict[str, Any]
-    average: dict[str, Any]  # exponential moving average of the weights: what is shipped
-    optimiser: Any
-    step: Array
+    training: TrainingConfig
+    prior: Prior  # its settings and name; the weights at step 0
+    mesh: Mesh
+    train: Shapes  # on every device
+    rows: Array  # to draw from
+    val: Shapes
+    out: Path
+    deadline: float  # of time.monotonic()
 
 
 def main(
-    config: Path, shards: tuple[Path, ...], out: Path, minutes: float = math.inf, name: str = ""
+    config: Path,
+    shards: tuple[Path, ...],
+    out: Path,
+    minutes: float = math.inf,
+    name: str = "",
+    coordinator: str = "",
+    processes: int = 1,
+    process: int = 0,
 ) -> None:
     """Trains until the configured number of steps, or for `minutes`.
 
     Args:
         config: YAML with `model` and `training`.
-        shards: folders that `python -m train.prepare` wrote.
-        out: checkpoints, log.jsonl and weights.npz.
+        shards: folders that `python -m train.prepare` wrote, or files of `train.pack`; one that is named twice
+            is drawn from twice as often.
+        out: checkpoints, log.jsonl, curves, pictures, weights.npz (the last) and best.npz. Shared by all hosts.
         minutes: wall-clock budget.
         name: of the weights; by default the configuration file's.
+        coordinator: host:port of process 0, on a run of several processes.
+        processes: how many there are.
+        process: which of them this is.
     """
     deadline = time.monotonic() + 60 * minutes
-    settings = load_config(config, TrainingRun)
-    train, val = load_shapes(shards, "train"), load_shapes(shards, "val")
-    model = calibrated(settings.model, settings.training, train)
-    prior = init_prior(model, jax.random.key(settings.training.seed), name or config.stem)
+    connect(coordinator, processes, process)
+    setting = prepared(load_config(config, TrainingRun), shards, out, deadline, name or config.stem)
     out.mkdir(parents=True, exist_ok=True)
-    state = initial_state(prior, settings.training)
-    options = ocp.CheckpointManagerOptions(max_to_keep=2)
-    with ocp.CheckpointManager((out / "checkpoints").absolute(), options=options) as manager:
-        if (latest := manager.latest_step()) is not None:
-            state = manager.restore(latest, args=ocp.args.StandardRestore(state))
-        state = train_until(deadline, state, prior, settings.training, train, val, out, manager)
-    save_prior(dataclasses.replace(prior, params=state.average), out / "weights.npz")
+    with open_checkpoints(out / "checkpoints") as manager:
+        state = everywhere(setting.mesh, initial_state(setting.prior, setting.training))
+        state, step = resume(manager, state)
+        state = train_until(setting, state, step, manager)
+        manager.wait_until_finished()
+    if is_first():
+        save_prior(averaged(setting, state), out / "weights.npz")
+
+
+def prepared(
+    settings: TrainingRun, shards: tuple[Path, ...], out: Path, deadline: float, name: str
+) -> Setting:
+    """Loads the shapes, initialises the weights, spreads both over the devices."""
+    training = settings.training
+    mesh = device_mesh(training.batch)
+    train, rows = load_mix(shards, "train")
+    val, _ = load_mix(shards, "val")
+    model = calibrated(settings.model, training, train)
+    return Setting(
+        training=training,
+        prior=init_prior(model, jax.random.key(training.seed), name),
+        mesh=mesh,
+        train=everywhere(mesh, train),
+        rows=everywhere(mesh, jnp.asarray(rows)),
+        val=val,
+        out=out,
+        deadline=deadline,
+    )
 
 
 def calibrated(model: PriorConfig, training: TrainingConfig, shapes: Shapes) -> PriorConfig:
     """Chooses the encoder's output constant so that F_s ≈ 1 at step 0 on the training shapes (METHOD 1)."""
     unit = dataclasses.replace(model, encoder=dataclasses.replace(model.encoder, output_scale=1.0))
     prior = init_prior(unit, jax.random.key(training.seed))
-    index = jnp.arange(min(32, len(shapes.views)))
+    index = jnp.asarray(np.linspace(0, len(shapes.views) - 1, min(32, len(shapes.views))).astype(int))
     sample = sample_batch(jax.random.key(training.seed), shapes, index, training, model.encoder.points)
     scale = jax.jit(jax.vmap(partial(encode_ordered, prior)))(sample.points[:, 0], sample.mask[:, 0]).scale
     constant = float(f"{1 / float(scale.mean()):.3g}")
     return dataclasses.replace(model, encoder=dataclasses.replace(model.encoder, output_scale=constant))
 
 
-def optimiser(config: TrainingConfig) -> optax.GradientTransformation:
-    """Adam with warm-up, cosine decay to 1 % and clipped gradients."""
-    peak, warmup = config.learning_rate, config.warmup_steps
-    rate = optax.warmup_cosine_decay_schedule(0.0, peak, warmup, config.steps, 0.01 * peak)
-    adam = optax.chain(optax.clip_by_global_norm(config.clip), optax.adam(rate))
-    return optax.apply_if_finite(adam, max_consecutive_errors=20)
-
-
-def initial_state(prior: Prior, config: TrainingConfig) -> TrainingState:
-    """The state at step 0."""
-    return TrainingState(
-        params=prior.params,
-        average=jax.tree.map(jnp.copy, prior.params),
-        optimiser=optimiser(config).init(prior.params),
-        step=jnp.zeros((), jnp.int32),
-    )
-
-
-@partial(jax.jit, static_argnames="config", donate_argnames="state")
-def training_step(
-    state: TrainingState, prior: Prior, shapes: Shapes, config: TrainingConfig
-) -> tuple[TrainingState, dict[str, Array]]:
-    """One Adam step; what it sees depends on (seed, step) alone, so a resumed run sees the same."""
-    key = jax.random.fold_in(jax.random.key(config.seed), state.step)
-    index_key, sample_key, dropout_key = jax.random.split(key, 3)
-    index = jax.random.randint(index_key, (config.batch,), 0, shapes.views.shape[0])
-    sample = sample_batch(sample_key, shapes, index, config, prior.config.encoder.points)
-
-    def loss(params: dict[str, Any]) -> tuple[Array, dict[str, Array]]:
-        return total_loss(dataclasses.replace(prior, params=params), sample, config, dropout_key)
-
-    gradient, terms = jax.grad(loss, has_aux=True)(state.params)
-    updates, opt_state = optimiser(config).update(gradient, state.optimiser, state.params)
-    params = optax.apply_updates(state.params, updates)
-    # Early on the average follows quickly, or it would remember the random start for long.
-    keep = jnp.minimum(config.ema, (1 + state.step) / (10 + state.step))
-    average = jax.tree.map(lambda old, new: keep * old + (1 - keep) * new, state.average, params)
-    terms = terms | {"gradient": optax.global_norm(gradient)}
-    return TrainingState(params=params, average=average, optimiser=opt_state, step=state.step + 1), terms  # type: ignore[arg-type]
+def averaged(setting: Setting, state: TrainingState) -> Prior:
+    """The prior with the averaged weights, on this process' first device."""
+    return dataclasses.replace(setting.prior, params=here(state.average))
 
 
 def train_until(
-    deadline: float,
-    state: TrainingState,
-    prior: Prior,
-    config: TrainingConfig,
-    train: Shapes,
-    val: Shapes,
-    out: Path,
-    manager: ocp.CheckpointManager,
+    setting: Setting, state: TrainingState, step: int, manager: ocp.CheckpointManager
 ) -> TrainingState:
-    """Steps until `config.steps` or the deadline; validates and checkpoints every so often and at the end."""
+    """Steps until `steps` or the deadline; validates and checkpoints every so often and at the end."""
+    config, began = setting.training, time.monotonic()
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    began, sums, since = time.monotonic(), {}, 0
-    with Progress(*columns) as progress:
-        task = progress.add_task("training", total=config.steps, completed=int(state.step))
-        while int(state.step) < config.steps and time.monotonic() < deadline:
-            state, terms = training_step(state, prior, train, config)
-            sums = {k: sums.get(k, 0.0) + float(v) for k, v in terms.items()}
-            since += 1
-            progress.update(task, advance=1, description=f"training, sdf {sums['sdf'] / since:.4f}")
-            if int(state.step) % config.validate_every == 0:
-                mean = {k: v / since for k, v in sums.items()}
-                report(out, state, prior, config, val, mean, time.monotonic() - began)
-                manager.save(int(state.step), args=ocp.args.StandardSave(state))
-                sums, since = {}, 0
-    if manager.latest_step() != int(state.step):
-        manager.save(int(state.step), args=ocp.args.StandardSave(state))
-    manager.wait_until_finished()
+    book = Journal(setting.out, step) if is_first() else nullcontext()
+    with Progress(*columns, disable=not is_first()) as progress, book as journal:
+        task = progress.add_task("training", total=config.steps, completed=step)
+        terms: list[dict[str, Array]] = []
+        while step < config.steps and not agreed(time.monotonic() > setting.deadline):
+            state, last = training_step(
+                state,
+                setting.train,
+                setting.rows,
+                model=setting.prior.config,
+                config=config,
+                mesh=setting.mesh,
+            )
+            step += 1
+            show(progress, task, terms)
+            terms.append(last)
+            if step % config.validate_every == 0:
+                scores = validated(setting, state)
+                if journal is not None:
+                    report(journal, setting, state, step, time.monotonic() - began, means(terms), scores)
+                keep(manager, step, state, scores["score"])
+                terms, began = [], time.monotonic()
+        keep(manager, step, state)
     return state
 
 
+def show(progress: Progress, task: TaskID, terms: list[dict[str, Array]]) -> None:
+    """Moves the bar on. Reads the step before, so that the devices never wait for the host."""
+    if terms:
+        progress.update(task, description=f"training, sdf {float(terms[-1]['sdf']):.4f}")
+    progress.advance(task)
+
+
+def means(terms: list[dict[str, Array]]) -> dict[str, float]:
+    """Of every term over the steps."""
+    host: list[dict[str, Any]] = jax.device_get(terms)
+    return {name: float(np.mean([t[name] for t in host])) for name in host[0]}
+
+
+def validated(setting: Setting, state: TrainingState) -> dict[str, float]:
+    """Scores of the averaged weights. Every process computes them for itself: no process waits for another."""
+    scores = validate(averaged(setting, state), setting.val, setting.training)
+    return scores | {"score": total_score(scores)}
+
+
 def report(
-    out: Path,
+    journal: Journal,
+    setting: Setting,
     state: TrainingState,
-    prior: Prior,
-    config: TrainingConfig,
-    val: Shapes,
-    mean: dict[str, float],
-    s: float,
+    step: int,
+    seconds: float,
+    train: dict[str, float],
+    scores: dict[str, float],
 ) -> None:
-    """Appends training means and validation scores to log.jsonl and writes the averaged weights."""
-    averaged = dataclasses.replace(prior, params=state.average)
-    scores = validate(averaged, val, config)
-    line = {"step": int(state.step), "seconds": round(s, 1), "train": mean, "val": scores}
-    with (out / "log.jsonl").open("a") as log:
-        log.write(json.dumps(line, default=lambda x: np.asarray(x).item()) + "\n")
-    save_prior(averaged, out / "weights.npz")
+    """Writes log, weights (the best ones too) and, every `picture_every` steps, a picture."""
+    prior, config = averaged(setting, state), setting.training
+    if scores["score"] > journal.best:
+        save_prior(prior, setting.out / "best.npz")
+    save_prior(prior, setting.out / "weights.npz")
+    journal.write(step, journal.seconds + seconds, train, scores)
+    if step // config.picture_every > (step - config.validate_every) // config.picture_every:
+        journal.picture(step, held_out(prior, setting.val, config, IN_PICTURE))
 
 
 if __name__ == "__main__":

@@ -30,6 +30,11 @@ def validate(prior: Prior, shapes: Shapes, config: TrainingConfig) -> dict[str, 
     return {k: float(jnp.mean(jnp.concatenate([r[k] for r in rows]))) for k in rows[0]}
 
 
+def total_score(scores: dict[str, float]) -> float:
+    """One figure to choose a checkpoint by: the mean of the shares that the three tasks live by."""
+    return (scores["near_sign"] + scores["matching"] + scores["kabsch_10deg"]) / 3
+
+
 def _scores(
     prior: Prior, shapes: Shapes, index: Array, seed: int, config: TrainingConfig
 ) -> dict[str, Array]:
