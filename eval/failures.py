@@ -29,7 +29,9 @@ Points = Float[np.ndarray, "_ 3"]
 NEAR_DEG = 15.0  # of a quarter or half turn; and what is a slip rather than another place
 LITTLE_OVERLAP = 0.5  # share of what either cloud shows that both show
 WITHIN_M = 0.05  # points of two clouds show the same place
+TIPPED_DEG = 45.0  # from the vertical, of an object that only turns about it
 CAUSES = {
+    "tipped": "tipped over, though objects only turn about the vertical",
     "turned": "turned by nearly a quarter or half: the object looks almost the same",
     "slipped": f"right but for less than {NEAR_DEG:g}°: the fit slides along the surface",
     "little": "elsewhere, and the two scans show different sides",
@@ -58,7 +60,7 @@ def main(records: Path, data: Path, out: Path, method: str | None = None, exampl
         for r in own:
             if r["re_deg.strict"] is None or r["re_deg.strict"] >= known.right_deg:
                 shown = overlap(scene, object_of(scene, r), r["to_scan"])
-                found[cause_of(r, shown)].append({**r, "scene": scene.name, "overlap": shown})
+                found[cause_of(r, shown, known.upright)].append({**r, "scene": scene.name, "overlap": shown})
     out.mkdir(parents=True, exist_ok=True)
     write_json(out / "causes.json", {"method": method, "pairs": total, "causes": found})
     (out / "causes.md").write_text(table(found, total, method), encoding="utf-8")
@@ -81,11 +83,13 @@ def overlap(scene: KnownScene, o: KnownObject, scan: int) -> float:
     return float(np.concatenate(near).mean())
 
 
-def cause_of(record: Record, shown: float) -> str:
+def cause_of(record: Record, shown: float, upright: bool) -> str:
     """Which of `CAUSES` a failure is counted under."""
     error = record["re_deg.strict"]
     if error is None:
         return "none"
+    if upright and np.array(record["pose"])[2, 2] < np.cos(np.deg2rad(TIPPED_DEG)):
+        return "tipped"
     if error < NEAR_DEG:
         return "slipped"
     if min(abs(error - 90), abs(error - 180)) < NEAR_DEG:

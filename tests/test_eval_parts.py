@@ -41,7 +41,13 @@ def test_five_settings_and_all_variables_are_named():
     ],
 )
 def test_causes(error, shown, cause):
-    assert cause_of({"re_deg.strict": error}, shown) == cause
+    record = {"re_deg.strict": error, "pose": np.eye(4).tolist()}
+    assert cause_of(record, shown, upright=True) == cause
+
+
+def test_an_upright_object_that_lies_on_its_side_has_tipped_over():
+    record = {"re_deg.strict": 179.0, "pose": pose(170, [0, 0, 0], "x").tolist()}
+    assert (cause_of(record, 0.9, upright=True), cause_of(record, 0.9, upright=False)) == ("tipped", "turned")
 
 
 def test_table_of_causes_counts_every_failure():
