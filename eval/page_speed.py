@@ -1,0 +1,143 @@
+"""How heavy the page is: file size, first paint and time a frame for a large room, in a real browser.
+
+`python -m eval.page_speed --out runs/page_speed`; needs Chromium on the PATH. Without a graphics card Chromium draws
+in software, which is the case measured.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import trimesh
+from rich.console import Console
+from rich.table import Table
+
+from more2_jax.config import SceneConfig
+from more2_jax.prior import encode_ordered, load_prior
+from more2_jax.report import write_report
+from more2_jax.types import Changes, Embedding, LivingScene, Mesh, Observation, ScanRecord, SceneObject
+from train.program import run
+
+SOFTWARE_GL = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+FRAMES = 15
+SPACING_M = 1.5
+PAINT = "performance.getEntriesByName('first-contentful-paint').map(e => e.startTime)[0] ?? null"
+
+
+def main(
+    out: Path, objects: int = 60, points: int = 500_000, scans: int = 3, width: int = 1280, height: int = 720
+) -> None:
+    """Writes the page of a made-up room and measures it.
+
+    Args:
+        out: folder for report.html and results.json.
+        objects: in the room, each seen in every scan.
+        points: of all objects together.
+        scans: visits.
+        width: of the window, pixels.
+        height: of the window, pixels.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    page = out / "report.html"
+    write_report(room(objects, points // objects, scans), page, SceneConfig())
+    results = {"objects": objects, "points": points, "page (MB)": page.stat().st_size / 1e6}
+    results |= measured(page, width, height)
+    (out / "results.json").write_text(json.dumps(results, indent=1))
+    table = Table("figure", "value")
+    for name, value in results.items():
+        table.add_row(name, f"{value:.2f}" if isinstance(value, float) else str(value))
+    Console().print(table)
+
+
+def room(objects: int, points: int, scans: int) -> LivingScene:
+    """Objects in a grid; every other one moves 0.4 m between scans."""
+    rng = np.random.default_rng(0)
+    side = int(np.ceil(np.sqrt(objects)))
+    embedding = some_embedding()
+    made = []
+    for k in range(objects):
+        place = np.array([k % side, k // side, 0.0]) * SPACING_M
+        solid = trimesh.creation.icosphere(subdivisions=4, radius=0.4)
+        shape = np.array(solid.vertices) * rng.uniform(0.5, 1.3, 3)
+        cloud = shape[rng.integers(0, len(shape), points)] + rng.normal(0, 0.005, (points, 3)) + place
+        seen = tuple(observation(s, k, -0.4 * s * (k % 2)) for s in range(scans))
+        made.append(
+            SceneObject(
+                id=f"object_{k + 1:03d}",
+                label=f"thing {k}",
+                reference_scan=0,
+                observations=seen,
+                points=cloud,
+                point_scan=np.sort(rng.integers(0, scans, points)),
+                embedding=embedding,
+                mesh=Mesh(vertices=shape + place, faces=np.array(solid.faces, np.int32)),
+            )
+        )
+    return LivingScene(
+        preset="robust",
+        prior="small",
+        upright=True,
+        scans=tuple(
+            ScanRecord(index=s, name=f"visit {s}", source="made up", instances=tuple(range(objects)))
+            for s in range(scans)
+        ),
+        objects=tuple(made),
+        changes=tuple(
+            Changes(
+                from_scan=s,
+                to_scan=s + 1,
+                moved=tuple(o.id for o in made[1::2]),
+                static=tuple(o.id for o in made[::2]),
+            )
+            for s in range(scans - 1)
+        ),
+    )
+
+
+def observation(scan: int, instance: int, shift: float) -> Observation:
+    """Seen `shift` metres along x from where the reference scan saw it."""
+    T = np.eye(4)
+    T[0, 3] = shift
+    return Observation(scan=scan, instance=instance, T_ref_scan=T, score=0.9, rms_m=0.01, converged=True)
+
+
+def some_embedding() -> Embedding:
+    """An embedding of the right shapes; the page does not show it."""
+    prior = load_prior("small")
+    count = prior.config.encoder.points
+    points = jax.random.normal(jax.random.key(0), (count, 3))
+    return jax.tree.map(np.asarray, encode_ordered(prior, points, jnp.ones(count, bool)))
+
+
+def measured(path: Path, width: int, height: int) -> dict[str, Any]:
+    """First paint and interactive time (ms), and milliseconds a frame at full quality and while dragging."""
+    from playwright.sync_api import sync_playwright
+
+    chromium = shutil.which("chromium") or shutil.which("google-chrome")
+    if chromium is None:
+        raise ValueError("no Chromium on the PATH; needed to open the page (`apt-get install chromium`)")
+    with sync_playwright() as driver:
+        browser = driver.chromium.launch(executable_path=chromium, args=SOFTWARE_GL)
+        page = browser.new_page(viewport={"width": width, "height": height})
+        page.goto(path.resolve().as_uri())
+        page.wait_for_function("Boolean(window.more2?.ready)", timeout=120_000)
+        result = {
+            "first paint (ms)": page.evaluate(PAINT),
+            "ready (ms)": page.evaluate("performance.now()"),
+            "browser": browser.version,
+        }
+        for name, level in (("frame, full quality (ms)", 0), ("frame, while dragging (ms)", 2)):
+            result[name] = page.evaluate(f"window.more2.measure({FRAMES}, {level})")
+        page.screenshot(path=str(path.with_suffix(".png")))
+        browser.close()
+    return result
+
+
+if __name__ == "__main__":
+    run(main)
