@@ -88,16 +88,14 @@ def room(objects: int, points: int, scans: int) -> LivingScene:
             for s in range(scans)
         ),
         objects=tuple(made),
-        changes=tuple(
-            Changes(
-                from_scan=s,
-                to_scan=s + 1,
-                moved=tuple(o.id for o in made[1::2]),
-                static=tuple(o.id for o in made[::2]),
-            )
-            for s in range(scans - 1)
-        ),
+        changes=tuple(changes(s, made) for s in range(scans - 1)),
     )
+
+
+def changes(scan: int, objects: list[SceneObject]) -> Changes:
+    """What happened after visit `scan`."""
+    names = [o.id for o in objects]
+    return Changes(from_scan=scan, to_scan=scan + 1, moved=tuple(names[1::2]), static=tuple(names[::2]))
 
 
 def observation(scan: int, instance: int, shift: float) -> Observation:
