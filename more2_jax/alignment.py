@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float
 from more2_jax.geometry import FAR, Sampled, nearest
 from more2_jax.types import pytree
 
-ALONG = 0.05  # weight of sliding along the surface, against leaving it
+ALONG = 0.02  # weight of sliding along the surface, against leaving it
 DAMPING = 1e-4  # of the normal equations, in shares of their trace: a ball may turn freely
 NO_TILT = (1.0, 1.0, 1.0, 0.0, 0.0, 1.0)  # shift, and turn about the vertical
 NEIGHBOURHOOD = 2.5  # half width of a normal's neighbourhood, in median distances between neighbours
@@ -44,9 +44,44 @@ def surface(cloud: Sampled) -> Surface:
         products = (cloud.dense[:, :, None] * cloud.dense[:, None, :]).reshape(-1, 9)
         second = jnp.matmul(weight, products, precision="highest").reshape(-1, 3, 3)
         spread = second - mean[:, :, None] * mean[:, None, :]
-        return jnp.linalg.eigh(spread)[1][..., 0]
+        return least_axis(spread)
 
     return Surface(sampled=cloud, normals=normals(cloud.points), dense_normals=normals(cloud.dense))
+
+
+# Batched LAPACK calls that run at the same time can wait for one another for ever on the few threads of a small CPU
+# (jaxlib 0.10.2: each splits its batch over the pool it runs on). The two small ones here are plain arithmetic.
+
+
+def least_axis(matrix: Float[Array, "*b 3 3"]) -> Float[Array, "*b 3"]:
+    """Unit eigenvector of the smallest eigenvalue of symmetric matrices, in closed form; any where it is repeated."""
+    size = jnp.maximum(jnp.trace(matrix, axis1=-2, axis2=-1), 1e-20)[..., None, None]
+    a = matrix / size
+    eye = jnp.eye(3, dtype=a.dtype)
+    third = jnp.trace(a, axis1=-2, axis2=-1) / 3
+    b = a - third[..., None, None] * eye
+    p = jnp.sqrt(jnp.sum(b * b, axis=(-2, -1)) / 6 + 1e-20)
+    det = jnp.sum(b[..., 0, :] * jnp.cross(b[..., 1, :], b[..., 2, :]), axis=-1)
+    angle = jnp.arccos(jnp.clip(det / (2 * p**3), -1.0, 1.0)) / 3
+    least = third + 2 * p * jnp.cos(angle + 2 * jnp.pi / 3)
+    m = a - least[..., None, None] * eye  # its rows span the plane across the axis
+    crossed = jnp.stack([jnp.cross(m[..., i, :], m[..., (i + 1) % 3, :]) for i in range(3)], axis=-2)
+    squared = jnp.sum(crossed**2, axis=-1)
+    longest = jnp.argmax(squared, axis=-1)[..., None]
+    axis = jnp.take_along_axis(crossed, longest[..., None], axis=-2)[..., 0, :]
+    length = jnp.sqrt(jnp.take_along_axis(squared, longest, axis=-1))
+    return jnp.where(length > 1e-12, axis / jnp.maximum(length, 1e-12), jnp.array([0.0, 0.0, 1.0]))
+
+
+def solve_spd(matrix: Float[Array, "n n"], right: Float[Array, "n m"]) -> Float[Array, "n m"]:
+    """`matrix⁻¹ right` of a small positive definite matrix, by elimination without pivots."""
+    rows = jnp.concatenate([matrix, right], axis=1)
+    count = len(matrix)
+    for k in range(count):
+        row = rows[k] / rows[k, k]
+        others = rows - rows[:, k : k + 1] * row
+        rows = others.at[k].set(row)
+    return rows[:, count:]
 
 
 def spacing(points: Float[Array, "n 3"], mask: Bool[Array, " n"]) -> Float[Array, ""]:
@@ -148,7 +183,7 @@ def align_step(
     """One Gauss-Newton step; `upright`: shifts, and turns about the vertical only."""
     equations = normal_equations(T, source, target, reach)
     free = free_directions(upright)
-    step = jnp.linalg.solve(solvable(equations.matrix, upright), equations.vector * free)
+    step = solve_spd(solvable(equations.matrix, upright), (equations.vector * free)[:, None])[:, 0]
     return jaxlie.SE3.exp(step) @ T
 
 
@@ -161,7 +196,7 @@ def pose_covariance(
     """
     equations = normal_equations(T, source, target, jnp.asarray(reach))
     free = free_directions(upright)
-    inverse = jnp.linalg.inv(solvable(equations.matrix, upright)) * free * free[:, None]
+    inverse = solve_spd(solvable(equations.matrix, upright), jnp.eye(6)) * free * free[:, None]
     return inverse * equations.variance / jnp.maximum(equations.count, 1.0)
 
 

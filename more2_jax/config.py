@@ -96,6 +96,9 @@ class RegistrationConfig:
     surface_steps: int = 15
     first_reach: float = 0.15  # of a correspondence, shares of the target's radius: at first,
     last_reach: float = 0.05  # and in the end
+    polish_points: int = 512  # then, for the best pose alone
+    polish_steps: int = 10
+    polish_reach: float = 0.02
     truncation: float = 0.1  # a point farther than this from the other cloud counts as this far
 
 

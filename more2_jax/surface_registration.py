@@ -42,7 +42,9 @@ def register_surfaces(
         poses = join(poses, stayed)  # also exactly as it is
     misfits = jax.vmap(lambda T: misfit(T, source, target, config.truncation))(poses)
     best = choose(misfits, config.identity_start)
-    T = jax.tree.map(lambda x: x[best], poses)
+    T = polished(jax.tree.map(lambda x: x[best], poses), pair, misfits[best], config, upright)
+    if config.identity_start:  # what stayed is exactly where it was
+        T = jax.tree.map(lambda x, y: jnp.where(best == len(misfits) - 1, y[0], x), T, stayed)
     rms = two_way_rms(move(T, source.sampled), target.sampled, config.trim)
     last = align_step(T, source, target, jnp.asarray(config.last_reach), upright)
     still = jnp.linalg.norm((last @ T.inverse()).log()) < STILL
@@ -57,6 +59,17 @@ def register_surfaces(
         competing=poses,
         competes=competing(poses, misfits, best),
     )
+
+
+def polished(
+    T: jaxlie.SE3, pair: Pair, before: Float[Array, ""], config: RegistrationConfig, upright: bool
+) -> jaxlie.SE3:
+    """The pose aligned with more points and a short reach; as it was if that makes it fit worse."""
+    source, target = (surface(thinned(c, config.polish_points)) for c in (pair.source, pair.target))
+    reach = (config.last_reach, config.polish_reach)
+    finer = align(T, source, target, reach, config.polish_steps, upright)
+    better = misfit(finer, source, target, config.truncation) <= before * STAYED_RATIO + STAYED_OFFSET
+    return jax.tree.map(lambda x, y: jnp.where(better, x, y), finer, T)
 
 
 def join(a: jaxlie.SE3, b: jaxlie.SE3) -> jaxlie.SE3:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from more2_jax.alignment import align, point_jacobian, pose_covariance, surface
+from more2_jax.alignment import align, least_axis, point_jacobian, pose_covariance, solve_spd, surface
 from more2_jax.geometry import sample
 from more2_jax.surface_registration import choose, competing, misfit
 
@@ -39,6 +39,28 @@ def test_normals_of_flat_faces_are_their_axes():
     along = np.abs(normals[np.arange(len(points)), axis])[inside]
     assert along.min() > 0.99
     np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-4)
+
+
+def test_least_axis_is_that_of_numpy():
+    rng = np.random.default_rng(6)
+    factors = rng.normal(size=(200, 3, 3)) * 10.0 ** rng.uniform(-4, 1, (200, 1, 1)) * [1.0, 0.5, 0.1]
+    matrices = factors @ np.swapaxes(factors, 1, 2)
+    matrices = np.concatenate([matrices, [np.diag([4.0, 1, 0]), np.diag([0, 1.0, 1])]])
+    values, vectors = np.linalg.eigh(matrices)
+    clear = values[:, 1] - values[:, 0] > 0.02 * values[:, 2]
+    got = np.asarray(least_axis(jnp.asarray(matrices, jnp.float32)))
+    assert clear.sum() > 100
+    assert np.abs(np.sum(got * vectors[..., 0], axis=1))[clear].min() > 0.999
+    for degenerate in (np.zeros((3, 3)), np.eye(3), np.diag([1.0, 0, 0])):
+        axis = np.asarray(least_axis(jnp.asarray(degenerate, jnp.float32)))
+        assert np.isfinite(axis).all() and np.linalg.norm(axis) == pytest.approx(1, abs=1e-4)
+
+
+def test_elimination_solves_what_numpy_solves():
+    rng = np.random.default_rng(7)
+    A = rng.normal(size=(6, 6))
+    A, b = A @ A.T + 0.1 * np.eye(6), rng.normal(size=(6, 2))
+    np.testing.assert_allclose(solve_spd(jnp.asarray(A), jnp.asarray(b)), np.linalg.solve(A, b), rtol=2e-3)
 
 
 def test_jacobian_is_the_derivative_of_a_moved_point():
