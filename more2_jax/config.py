@@ -91,6 +91,15 @@ class RegistrationConfig:
     icp_steps: int = 30
     trim: float = 1.0  # share of nearest distances that counts
     converged_rms: float = 0.05  # share of the target's radius
+    refine: Literal["descent", "surface"] = "descent"  # Adam on the loss and ICP, or point-to-plane both ways
+    surface_points: int = 256  # of each cloud, compared with all of the other
+    surface_steps: int = 15
+    first_reach: float = 0.15  # of a correspondence, shares of the target's radius: at first,
+    last_reach: float = 0.05  # and in the end
+    polish_points: int = 512  # then, for the best pose alone
+    polish_steps: int = 10
+    polish_reach: float = 0.02
+    truncation: float = 0.1  # a point farther than this from the other cloud counts as this far
 
 
 @dataclass(frozen=True)
@@ -209,11 +218,10 @@ def preset(name: str, *, upright: bool = False) -> SceneConfig:
                 starts="many",
                 identity_start=True,
                 yaw_starts=24 if upright else 0,
-                keep_starts=3,
-                steps=25,
-                learning_rate=0.01,
-                icp_steps=12,
+                keep_starts=6,
+                steps=0,
                 trim=0.7,
+                refine="surface",
             ),
             meshing=MeshingConfig(coarse=16, resolution=64, level="observed"),
             joint=JointConfig(points=128, start="accumulated", steps=40, eqv_learning_rate=1e-3),

@@ -32,6 +32,7 @@ from more2_jax.geometry import (
 )
 from more2_jax.prior import Prior, field_sdf, object_field
 from more2_jax.starts import Pair, candidate_poses
+from more2_jax.surface_registration import register_surfaces
 from more2_jax.types import Embedding, PointCloud, Registration, scale_embedding
 
 STILL = 1e-2  # a last ICP step below this (radians, and shares of the radius) has settled
@@ -103,13 +104,28 @@ def register_one(prior: Prior, pair: Pair, config: RegistrationConfig, upright: 
     radius = cloud_radius(pair.target.points, pair.target.mask)
     pair = rescale(pair, 1 / radius)
     starts = keep_best(candidate_poses(pair, config, upright), pair, config)
+    if config.refine == "surface":
+        return in_metres(register_surfaces(starts, pair, config, upright), radius)
     refined = jax.vmap(lambda T: refine(prior, T, pair, config))(starts)
     if config.identity_start:
         refined = with_stayed(prior, refined, pair, config)
-    best = choose(refined, config)
-    T = best.T_target_source
-    T = jaxlie.SE3.from_rotation_and_translation(T.rotation(), T.translation() * radius)
-    return dataclasses.replace(best, T_target_source=T, rms_m=best.rms_m * radius)
+    return in_metres(choose(refined, config), radius)
+
+
+def in_metres(result: Registration, radius: Float[Array, ""]) -> Registration:
+    """A registration found in units of `radius`."""
+
+    def scaled(T: jaxlie.SE3) -> jaxlie.SE3:
+        return jaxlie.SE3.from_rotation_and_translation(T.rotation(), T.translation() * radius)
+
+    unit = jnp.where(jnp.arange(6) < 3, radius, 1.0)
+    return dataclasses.replace(
+        result,
+        T_target_source=scaled(result.T_target_source),
+        rms_m=result.rms_m * radius,
+        covariance=None if result.covariance is None else result.covariance * unit * unit[:, None],
+        competing=None if result.competing is None else scaled(result.competing),
+    )
 
 
 def rescale(pair: Pair, factor: Float[Array, ""]) -> Pair:

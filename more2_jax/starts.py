@@ -45,7 +45,9 @@ def candidate_poses(pair: Pair, config: RegistrationConfig, upright: bool) -> ja
 
 def candidate_rotations(pair: Pair, config: RegistrationConfig, upright: bool) -> jaxlie.SO3:
     """The embedding's rotation, its flips about the target's principal axes, principal axes on principal axes,
-    and turns about the vertical (`upright`) or the 24 rotations of a cube after the embedding's."""
+    and turns about the vertical (`upright`) or the 24 rotations of a cube after the embedding's.
+
+    `upright`: of each, the nearest turn about the vertical."""
     by_code = kabsch_rotation(pair.source_code.eqv.T, pair.target_code.eqv.T).as_matrix()
     source_axes = principal_axes(pair.source.points, pair.source.mask)
     target_axes = principal_axes(pair.target.points, pair.target.mask)
@@ -57,7 +59,13 @@ def candidate_rotations(pair: Pair, config: RegistrationConfig, upright: bool) -
     else:
         others = jnp.asarray(cube_rotations()) @ by_code
     matrices = jnp.concatenate([flipped, aligned, others.astype(by_code.dtype)])
-    return jax.vmap(jaxlie.SO3.from_matrix)(matrices)
+    rotations = jax.vmap(jaxlie.SO3.from_matrix)
+    return rotations(matrices) if not upright else jax.vmap(jaxlie.SO3.from_z_radians)(yaw_of(matrices))
+
+
+def yaw_of(matrix: Float[Array, "*b 3 3"]) -> Float[Array, "*b"]:
+    """The turn about the vertical nearest to each rotation, radians; 0 where all are as near."""
+    return jnp.arctan2(matrix[..., 1, 0] - matrix[..., 0, 1], matrix[..., 0, 0] + matrix[..., 1, 1])
 
 
 def place(
