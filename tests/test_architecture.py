@@ -27,7 +27,15 @@ LAYERS = {
         "published",
         "checkpoint",
     ),
-    "stages": ("starts", "matching", "registration", "meshing", "joint"),
+    "stages": (
+        "alignment",
+        "starts",
+        "matching",
+        "surface_registration",
+        "registration",
+        "meshing",
+        "joint",
+    ),
     "scene": ("objects", "encoding", "tracking", "fitting", "scene"),
     "programs": ("io", "report", "export", "demo", "commands", "cli", "train", "eval"),
 }
