@@ -21,6 +21,7 @@ from more2_jax.types import Registration
 STILL = 1e-2  # a last step below this (radians, and shares of the radius) has settled
 # How much worse "it did not move" may fit and still be chosen; so much worse, another pose still competes.
 STAYED_RATIO, STAYED_OFFSET = 1.1, 0.01
+POINT_SHARE = 0.4  # of the distance to the nearest point, in a misfit; the rest is that off its surface
 TURNED_DEG = 15.0  # competing poses differ by more
 
 
@@ -83,15 +84,20 @@ def thinned(cloud: Sampled, count: int) -> Sampled:
 
 
 def misfit(T: jaxlie.SE3, source: Surface, target: Surface, truncation: float) -> Float[Array, ""]:
-    """Mean truncated nearest distance both ways, as a share of the truncation; 1 if the pose is not finite."""
-    squared = correspondences(T, source, target).squared
-    count = len(source.normals)
-    shares = []
-    for part in (squared[:count], squared[count:]):
-        real = part < FAR
-        share = jnp.minimum(jnp.sqrt(jnp.where(real, part, 0.0) + 1e-12) / truncation, 1.0)
-        shares.append(jnp.where(real, share, 0.0).sum() / jnp.maximum(real.sum(), 1))
-    mean = (shares[0] + shares[1]) / 2
+    """Mean truncated distance both ways, as a share of the truncation; 1 if the pose is not finite.
+
+    Of a point near the other cloud it is mostly the distance off its surface: that to the nearest point has the
+    spacing of points for a floor, under which details such as a handle disappear.
+    """
+    c = correspondences(T, source, target)
+    gap, count = c.target - c.source, len(source.normals)
+    off = sum(jnp.sum(gap * normal, axis=-1) ** 2 for normal in (c.source_normal, c.target_normal)) / 2
+    near = (1 - POINT_SHARE) * off + POINT_SHARE * c.squared
+    squared = jnp.where(c.squared < truncation**2, near, c.squared)
+    share = jnp.minimum(jnp.sqrt(squared + 1e-12) / truncation, 1.0)
+    real = c.squared < FAR
+    ways = [(share[:count], real[:count]), (share[count:], real[count:])]
+    mean = sum(jnp.where(r, s, 0.0).sum() / jnp.maximum(r.sum(), 1) for s, r in ways) / 2
     return jnp.where(jnp.isfinite(mean) & jnp.isfinite(T.wxyz_xyz).all(), mean, 1.0)
 
 
