@@ -1,4 +1,4 @@
-"""What each part of `robust` registration is worth, on true pairs, beside many starts of GICP.
+"""What each part of registration by surfaces is worth, on true pairs, beside many starts of GICP.
 
 `python -m eval.ablation_robust --data rooms/sparse --scenes 5`
 """
@@ -52,16 +52,17 @@ def main(
 
 
 def variants(robust: RegistrationConfig) -> dict[str, RegistrationConfig]:
-    """The preset, and it without or with one thing."""
+    """Registration by surfaces, and it without or with one thing."""
     changes = {
-        "robust": {},
-        "descent on the field": {"refine": "descent", "keep_starts": 3, "steps": 25, "learning_rate": 0.01},
+        "surfaces": {},
+        "descent on the field": {"refine": "descent", "keep_starts": 3},
         "no polish": {"polish_steps": 0},
         "short reach at the end": {"last_reach": 0.03},
         "3 starts kept": {"keep_starts": 3},
         "12 starts kept": {"keep_starts": 12},
     }
-    return {name: dataclasses.replace(robust, **change) for name, change in changes.items()}
+    whole = dataclasses.replace(robust, refine="surface", keep_starts=6)
+    return {name: dataclasses.replace(whole, **change) for name, change in changes.items()}
 
 
 def table(records: list[Record], right_deg: float) -> Table:

@@ -1,7 +1,8 @@
 """Registration of one pair by its surfaces: every start aligned, the best told by a truncated distance.
 
-Beyond the paper (preset `robust`): point-to-plane alignment both ways takes the place of the descent on the field,
-and poses are compared by the share of both clouds that finds its like, not by a residual that the unseen spoils.
+Beyond the paper (`RegistrationConfig.refine` "surface"): point-to-plane alignment both ways takes the place of the
+descent on the field, and poses are compared by the share of both clouds that finds its like, not by a residual that
+the unseen spoils.
 """
 
 from __future__ import annotations

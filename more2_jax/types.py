@@ -89,16 +89,13 @@ class Registration:
     loss: Float[Array, "*batch"]  # what was minimised, at this very pose
     rms_m: Float[Array, "*batch"]  # trimmed root mean square of nearest distances, both ways
     converged: Bool[Array, "*batch"]  # the pose stopped moving and explains both clouds
-    misfit: Float[Array, "*batch"] | None = (
-        None  # what `robust` chose by: 0 none, 1 nothing of both clouds agrees
-    )
+    # The rest only where `RegistrationConfig.refine` is "surface".
+    misfit: Float[Array, "*batch"] | None = None  # chosen by: 0 none, 1 nothing of both clouds agrees
     covariance: Float[Array, "*batch 6 6"] | None = (
-        None  # of (shift m, turn rad) about the target's local zero
+        None  # of (shift m, turn rad), about the target's local zero
     )
     competing: jaxlie.SE3 | None = None  # (*batch, k): other poses tried to the end
-    competes: Bool[Array, "*batch k"] | None = (
-        None  # which of them explain both clouds as well, turned otherwise
-    )
+    competes: Bool[Array, "*batch k"] | None = None  # which explain both clouds as well, turned otherwise
 
 
 @pytree
