@@ -178,6 +178,7 @@ class TrainingConfig:
     contrast_weight: float = 0.05  # InfoNCE on F_inv between two partial clouds of one shape
     contrast_temperature: float = 0.07
     turn_weight: float = 0.5  # ‖F_eqv − F_eqv'‖² between them: same orientation in, same vectors out
+    rotation_weight: float = 0.0  # how far Kabsch's algorithm is from the identity between them
     sign_weight: float = 0.0  # cross-entropy of inside and outside
     sign_width: float = 0.01  # canonical units: where its sigmoid has half of its height
     up_weight: float = 0.0  # the first third of F_eqv should point up

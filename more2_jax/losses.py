@@ -14,6 +14,8 @@ from more2_jax.decoder import Decoder
 from more2_jax.prior import Prior, encode_ordered
 from more2_jax.types import Embedding
 
+LEAST_CORRELATION = 0.05  # of two F_eqv, whose norms are 1: below it their rotation is noise, and pulls less
+
 
 def sdf_loss(
     predicted: Float[Array, "*b q"], truth: Float[Array, "*b q"], near_surface: float
@@ -58,6 +60,17 @@ def turn_loss(eqv: Float[Array, "b 2 3 c"]) -> Float[Array, ""]:
     return jnp.mean(jnp.sum((eqv[:, 0] - eqv[:, 1]) ** 2, axis=(-2, -1)))
 
 
+def rotation_loss(eqv: Float[Array, "b 2 3 c"]) -> Float[Array, ""]:
+    """Mean of 1 − ⟨M, I⟩ / (‖M‖‖I‖), M = F_eqv F_eqv'ᵀ being what Kabsch's algorithm reads the rotation from.
+
+    `turn_loss` is lowered as well by vectors that all point along one axis, which says nothing of the turn about it:
+    here they score 0.42. 0 where M is a multiple of the identity, about 1 if the two are unrelated.
+    """
+    M = jnp.einsum("bic,bjc->bij", eqv[:, 0], eqv[:, 1])
+    length = jnp.sqrt(jnp.sum(M**2, axis=(-2, -1)) + LEAST_CORRELATION**2)
+    return 1.0 - jnp.mean(jnp.trace(M, axis1=-2, axis2=-1) / (jnp.sqrt(3.0) * length))
+
+
 def total_loss(
     prior: Prior, sample: TrainingSample, config: TrainingConfig, dropout_key: Array
 ) -> tuple[Float[Array, ""], dict[str, Float[Array, ""]]]:
@@ -71,6 +84,7 @@ def total_loss(
         "scale": jnp.mean(jnp.abs(jnp.log(embedding.scale))),
         "contrast": contrast_loss(embedding.inv[:, 0], embedding.inv[:, 1], config.contrast_temperature),
         "turn": turn_loss(embedding.eqv),
+        "rotation": rotation_loss(embedding.eqv),
         "sign": sign_loss(predicted, sample.sdf, config.sign_width),
         "up": up_loss(embedding.eqv),
     }
@@ -80,6 +94,7 @@ def total_loss(
         "scale": config.scale_weight,
         "contrast": config.contrast_weight,
         "turn": config.turn_weight,
+        "rotation": config.rotation_weight,
         "sign": config.sign_weight,
         "up": config.up_weight,
     }

@@ -14,11 +14,21 @@ from sphere_shards import sphere_shards
 from more2_jax.config import TrainingRun, load_config
 from more2_jax.data.sampling import sample_batch
 from more2_jax.data.shards import load_shapes
-from more2_jax.losses import contrast_loss, sdf_loss, sign_loss, total_loss, turn_loss, up_loss
+from more2_jax.losses import (
+    LEAST_CORRELATION,
+    contrast_loss,
+    rotation_loss,
+    sdf_loss,
+    sign_loss,
+    total_loss,
+    turn_loss,
+    up_loss,
+)
 from train import pack
 from train.journal import Journal, read_log
 from train.packed_shapes import read_shapes
 from train.pictures import EYE, splat
+from train.prior import started_warm
 from train.schedule import learning_rate
 from train.shape_mix import load_mix
 
@@ -68,6 +78,28 @@ def test_up_loss_is_zero_where_the_first_third_points_up_and_one_where_it_says_n
     np.testing.assert_allclose(up_loss(up), 0.0, atol=1e-12)
     np.testing.assert_allclose(up_loss(-up), 4.0, rtol=1e-6)
     np.testing.assert_allclose(up_loss(jnp.zeros((1, 2, 3, 6))), 1.0)
+
+
+def test_rotation_loss_is_zero_only_where_kabsch_finds_the_identity_and_no_turn_is_left_open():
+    whole = jnp.eye(3)[None] / jnp.sqrt(3.0)
+    turned = jnp.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]) @ whole
+    one_axis = jnp.zeros((1, 3, 3)).at[0, 2, 2].set(1.0)
+    none = LEAST_CORRELATION**2
+    for second, expected in ((whole, 0.0), (turned, 2 / 3), (-whole, 2.0)):
+        loss = rotation_loss(jnp.stack([whole, second], axis=1))
+        np.testing.assert_allclose(1 - (1 - expected) / np.sqrt(1 + 3 * none), loss, atol=1e-6)
+    loss = rotation_loss(jnp.stack([one_axis, one_axis], axis=1))
+    np.testing.assert_allclose(loss, 1 - 1 / np.sqrt(3 * (1 + none)), rtol=1e-6)
+    assert turn_loss(jnp.stack([one_axis, one_axis], axis=1)) == 0
+
+
+@pytest.mark.parametrize("change", ["encoder", "decoder"])
+def test_a_warm_start_from_another_model_is_refused_in_one_line(run, change):
+    model = run.model
+    other = {"encoder": {"code": 32}, "decoder": {"hidden": 32}}[change]
+    other = dataclasses.replace(model, **{change: dataclasses.replace(getattr(model, change), **other)})
+    with pytest.raises(ValueError, match="--warm-start small: its encoder is"):
+        started_warm(other, "small", "mine")
 
 
 def test_gradients_of_the_training_loss_are_finite(shards, run, tiny_prior):

@@ -26,7 +26,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextC
 from more2_jax.config import PriorConfig, TrainingConfig, TrainingRun, load_config
 from more2_jax.data.sampling import sample_batch
 from more2_jax.data.shards import Shapes
-from more2_jax.prior import Prior, encode_ordered, init_prior, save_prior
+from more2_jax.prior import Prior, encode_ordered, init_prior, load_prior, save_prior
 from train.checkpoints import keep, open_checkpoints, resume
 from train.devices import agreed, connect, device_mesh, everywhere, here, is_first
 from train.journal import Journal
@@ -59,6 +59,7 @@ def main(
     out: Path,
     minutes: float = math.inf,
     name: str = "",
+    warm_start: str = "",
     coordinator: str = "",
     processes: int = 1,
     process: int = 0,
@@ -72,13 +73,17 @@ def main(
         out: checkpoints, log.jsonl, curves, pictures, weights.npz (the last) and best.npz. Shared by all hosts.
         minutes: wall-clock budget.
         name: of the weights; by default the configuration file's.
+        warm_start: weights to begin with in a fresh `--out`: name of shipped ones, or a file; the optimiser starts
+            anew. The configuration's `model` has to be theirs.
         coordinator: host:port of process 0, on a run of several processes.
         processes: how many there are.
         process: which of them this is.
     """
     deadline = time.monotonic() + 60 * minutes
     connect(coordinator, processes, process)
-    setting = prepared(load_config(config, TrainingRun), shards, out, deadline, name or config.stem)
+    settings, name = load_config(config, TrainingRun), name or config.stem
+    first = started_warm(settings.model, warm_start, name) if warm_start else None
+    setting = prepared(settings, shards, out, deadline, name, first)
     out.mkdir(parents=True, exist_ok=True)
     with open_checkpoints(out / "checkpoints") as manager:
         state = everywhere(setting.mesh, initial_state(setting.prior, setting.training))
@@ -90,17 +95,21 @@ def main(
 
 
 def prepared(
-    settings: TrainingRun, shards: tuple[Path, ...], out: Path, deadline: float, name: str
+    settings: TrainingRun,
+    shards: tuple[Path, ...],
+    out: Path,
+    deadline: float,
+    name: str,
+    warm: Prior | None = None,
 ) -> Setting:
-    """Loads the shapes, initialises the weights, spreads both over the devices."""
+    """Loads the shapes, initialises the weights if none are given, spreads both over the devices."""
     training = settings.training
     mesh = device_mesh(training.batch)
     train, rows = load_mix(shards, "train")
     val, _ = load_mix(shards, "val")
-    model = calibrated(settings.model, training, train)
     return Setting(
         training=training,
-        prior=init_prior(model, jax.random.key(training.seed), name),
+        prior=warm or started_cold(settings, train, name),
         mesh=mesh,
         train=everywhere(mesh, train),
         rows=everywhere(mesh, jnp.asarray(rows)),
@@ -108,6 +117,29 @@ def prepared(
         out=out,
         deadline=deadline,
     )
+
+
+def started_cold(settings: TrainingRun, train: Shapes, name: str) -> Prior:
+    """Random weights, F_s being about 1."""
+    model = calibrated(settings.model, settings.training, train)
+    return init_prior(model, jax.random.key(settings.training.seed), name)
+
+
+def started_warm(model: PriorConfig, weights: str, name: str) -> Prior:
+    """Weights that were trained before. Raises ValueError if they are not of this model."""
+    prior = load_prior(weights)
+    scale = prior.config.encoder.output_scale  # measured at the start of their training, and theirs for good
+    wanted = dataclasses.replace(model, encoder=dataclasses.replace(model.encoder, output_scale=scale))
+    if different := [
+        f
+        for f in ("encoder", "decoder", "eqv_gain", "inv_gain")
+        if getattr(wanted, f) != getattr(prior.config, f)
+    ]:
+        raise ValueError(
+            f"--warm-start {weights}: its {different[0]} is {getattr(prior.config, different[0])}; needed"
+            f" {getattr(wanted, different[0])}, as configured"
+        )
+    return dataclasses.replace(prior, name=name)
 
 
 def calibrated(model: PriorConfig, training: TrainingConfig, shapes: Shapes) -> PriorConfig:
