@@ -25,13 +25,15 @@ RECONSTRUCTED = 0.7  # share of true points recalled, from which an object count
 TOLERANCE = 0.01  # of the diagonal, for precision, recall and F
 PUBLISHED_SAMPLES = 30_000
 RECALL_SAMPLES = 4_000
-KEYS = (
+DISTANCES: tuple[str, ...] = (
     "chamfer.paper",
     "chamfer.published",
     "chamfer_m.strict",
     "accuracy_m",
     "completeness_m",
     "completeness_diagonal",
+)
+SHARES: tuple[str, ...] = (
     "f",
     "iou.paper",
     "iou.published",
@@ -40,20 +42,12 @@ KEYS = (
     "recall.strict",
     "watertight",
 )
+KEYS = DISTANCES + SHARES
 
 
 def no_mesh() -> Scores:
     """Scores where there is no surface: nothing recalled, nothing enclosed, no distance."""
-    zero = (
-        "f",
-        "iou.paper",
-        "iou.published",
-        "recall.paper",
-        "recall.published",
-        "recall.strict",
-        "watertight",
-    )
-    return {k: 0.0 if k in zero else None for k in KEYS}
+    return dict.fromkeys(DISTANCES) | dict.fromkeys(SHARES, 0.0)
 
 
 def mesh_scores(mesh: Mesh | None, truth: KnownObject, T_frame_model: Pose, samples: int = 100_000) -> Scores:
