@@ -80,11 +80,14 @@ class LocalLookup(nn.Module):
     def ask(self, field: LocalField, q: Float[Array, "n 3"]) -> Float[Array, "n w"]:
         """The blended functions and the distance, for every bandwidth; each of order one, near and far."""
         # −|q − x|²/2 up to what is the same for all anchors
-        closeness = q @ field.position.T - 0.5 * jnp.sum(field.position**2, axis=-1)
+        closeness = jnp.matmul(q, field.position.T, precision="highest") - 0.5 * jnp.sum(
+            field.position**2, axis=-1
+        )
         blend = []
         for table, bandwidth in zip(field.table, field.bandwidth, strict=True):
             weight = jax.nn.softmax(closeness / bandwidth**2, axis=-1, where=field.mask)
-            blend.append(self._blend(q, weight @ table, bandwidth))
+            # Positions are in the table, and covariances are small differences of their squares.
+            blend.append(self._blend(q, jnp.matmul(weight, table, precision="highest"), bandwidth))
         return jnp.concatenate(blend, axis=-1)
 
     def _blend(

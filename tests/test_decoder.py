@@ -10,7 +10,7 @@ import oracles
 import pytest
 
 from more2_jax.config import DecoderConfig, EncoderConfig, PriorConfig, TrainingRun, load_config
-from more2_jax.decoder import Decoder
+from more2_jax.decoder import Decoder, bfloat16_product
 from more2_jax.prior import field_sdf, init_prior, object_field, sdf, sdf_one
 from more2_jax.published import prior_from_published
 from more2_jax.types import Embedding
@@ -147,3 +147,27 @@ def test_sdf_takes_points_of_the_scan_far_from_zero(tiny_prior):
     np.testing.assert_allclose(sdf(tiny_prior, far, points + origin[:, None])[0], near, atol=1e-6)
     with pytest.raises(ValueError, match=r"needed \(objects, n, 3\)"):
         sdf(tiny_prior, far, np.repeat(points, 2, axis=0))
+
+
+@pytest.mark.parametrize("platform", ["cpu", "cuda", "tpu"])
+@pytest.mark.parametrize("train", [True, False])
+def test_products_are_rounded_on_accelerators_while_training_only(prior, platform, train):
+    decoder, code = Decoder(prior.config), random_code(prior.config.encoder.code)
+    points = jnp.zeros((20, 3))
+
+    def decode(params):
+        keys = {"dropout": jax.random.key(0)}
+        return decoder.apply({"params": params}, code, points, train, rngs=keys)
+
+    program = jax.jit(decode).trace(prior.params["decoder"]).lower(lowering_platforms=(platform,)).as_text()
+    assert ("bf16" in program) == (train and platform != "cpu")
+
+
+def test_rounded_products_have_three_digits():
+    h, kernel = (
+        jax.random.normal(jax.random.key(0), (50, 256)),
+        jax.random.normal(jax.random.key(1), (256, 64)),
+    )
+    exact = np.asarray(h, np.float64) @ np.asarray(kernel, np.float64)
+    error = np.abs(bfloat16_product(h, kernel) - exact) / np.sqrt(256)
+    assert 1e-5 < error.max() < 0.02 and error.mean() < 0.003
