@@ -19,6 +19,9 @@ CHECKED = (
 install_import_hook([f"more2_jax.{name}" for name in CHECKED.split()], "beartype.beartype")
 jax.config.update("jax_default_matmul_precision", "highest")
 
+# One browser for all tests of the page; after the hook, for it imports more2_jax.
+from page_browser import browser, common, opened, opener, report, said  # noqa: E402, F401
+
 
 @pytest.fixture(scope="session")
 def tiny_prior():

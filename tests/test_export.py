@@ -1,193 +1,22 @@
-"""Exports place every object where the scans saw it, and other readers agree."""
+"""What each export holds, and what is refused."""
 
 import dataclasses
 import json
 import sys
-from pathlib import Path
 
 import jsonschema
 import numpy as np
 import pytest
 import trimesh
+from export_readers import Z_UP_OF_Y_UP, Gltf, placed, seen_in
 from factories import living_scene, scene_object
 from plyfile import PlyData
 from scipy.spatial.transform import Rotation
 
 from more2_jax.export import export_scene, pose_in
-from more2_jax.types import LivingScene, Mesh, Observation, SceneObject
+from more2_jax.types import LivingScene
 
 SCENE = living_scene()
-Z_UP_OF_Y_UP = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]])  # glTF's (x, up, −y) back to (x, y, up)
-
-
-def seen_in(o, scan):
-    return next((s for s in o.observations if s.scan == scan), None)
-
-
-def placed(o, points, scan):
-    """The definition: `T_ref_scan` takes scan points to the reference, so its inverse brings them back."""
-    T = np.linalg.inv(seen_in(o, scan).T_ref_scan)
-    return (np.c_[points, np.ones(len(points))] @ T.T)[:, :3]
-
-
-def rigid(seed: int) -> np.ndarray:
-    """A turn about all axes and a shift of metres, 50 m from zero."""
-    T = np.eye(4)
-    T[:3, :3] = Rotation.random(random_state=seed).as_matrix()
-    T[:3, 3] = 50 + np.random.default_rng(seed).uniform(-3, 3, 3)
-    return T
-
-
-def simulated(number: int, scans: tuple[int, ...], *, mesh: bool = True) -> tuple[SceneObject, dict]:
-    """A chair-like shape put down anywhere in every scan; the object, and the points each scan observed.
-
-    Nothing here uses T_ref_scan except to store it: the observed points come from where the shape was put.
-    """
-    parts = [
-        trimesh.creation.box((0.6, 0.5, 0.1)),
-        trimesh.creation.box((0.1, 0.5, 0.9)).apply_translation([0.25, 0, 0.5]),
-    ]
-    shape = trimesh.util.concatenate(parts)
-    T_scan_shape = {s: rigid(10 * number + s) for s in scans}
-    observed = {
-        s: trimesh.transform_points(trimesh.sample.sample_surface(shape, 200, seed=s)[0], T)
-        for s, T in T_scan_shape.items()
-    }
-    T_ref_shape = T_scan_shape[scans[0]]
-    T_ref_scan = {s: T_ref_shape @ np.linalg.inv(T) for s, T in T_scan_shape.items()}
-    points = [trimesh.transform_points(observed[s], T_ref_scan[s]) for s in scans]
-    seen = tuple(
-        Observation(scan=s, instance=1, T_ref_scan=T_ref_scan[s], score=1.0, rms_m=0.0, converged=True)
-        for s in scans
-    )
-    o = dataclasses.replace(
-        scene_object(number, {scans[0]: np.eye(4)}),
-        observations=seen,
-        points=np.concatenate(points),
-        point_scan=np.repeat(scans, 200),
-        mesh=Mesh(vertices=trimesh.transform_points(shape.vertices, T_ref_shape), faces=shape.faces),
-    )
-    return (o if mesh else dataclasses.replace(o, mesh=None)), observed
-
-
-OBJECTS = [
-    simulated(0, (0, 1, 2)),
-    simulated(1, (1, 2)),
-    simulated(2, (0, 2)),
-    simulated(3, (0, 1), mesh=False),
-]
-ROOM = dataclasses.replace(SCENE, objects=tuple(o for o, _ in OBJECTS), changes=())
-OBSERVED = {o.id: observed for o, observed in OBJECTS}
-LARGEST_M = 1e-4  # files hold single precision, a few metres about the nodes
-
-
-def off_surface(vertices, faces, points) -> float:
-    """Largest distance of points from a mesh, metres; from the vertices where there are no faces."""
-    if faces is None:
-        return np.linalg.norm(points[:, None] - vertices[None], axis=-1).min(axis=1).max()
-    return np.abs(trimesh.proximity.signed_distance(trimesh.Trimesh(vertices, faces), points)).max()
-
-
-# --- what every format shows of an object in a scan: vertices and faces, None where absent ---------------------
-
-
-class Gltf:
-    """The animation, evaluated by hand as the standard says, on what pygltflib reads."""
-
-    def __init__(self, path: Path):
-        pygltflib = pytest.importorskip("pygltflib")
-        self.file = pygltflib.GLTF2().load(str(path))
-        self.nodes = {n.name: i for i, n in enumerate(self.file.nodes)}
-
-    def array(self, index: int) -> np.ndarray:
-        a = self.file.accessors[index]
-        view = self.file.bufferViews[a.bufferView]
-        width = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}[a.type]
-        dtype = {5126: "<f4", 5125: "<u4"}[a.componentType]
-        start = (view.byteOffset or 0) + (a.byteOffset or 0)
-        return np.frombuffer(self.file.binary_blob(), dtype, a.count * width, start).reshape(a.count, width)
-
-    def sampled(self, node: int) -> dict[str, tuple[np.ndarray, np.ndarray, str]]:
-        (animation,) = self.file.animations
-        chosen = [c for c in animation.channels if c.target.node == node]
-        samplers = {c.target.path: animation.samplers[c.sampler] for c in chosen}
-        return {
-            k: (self.array(s.input)[:, 0], self.array(s.output), s.interpolation) for k, s in samplers.items()
-        }
-
-    def at(self, name: str, scan: int) -> dict[str, np.ndarray]:
-        """Translation, rotation, scale at a keyframe; STEP and LINEAR agree there."""
-        found = self.sampled(self.nodes[name])
-        return {path: values[times.tolist().index(scan)] for path, (times, values, _) in found.items()}
-
-    def shown(self, name: str, scan: int):
-        keys = self.at(name, scan)
-        if not keys["scale"].any():
-            return None
-        primitive = self.file.meshes[self.file.nodes[self.nodes[name]].mesh].primitives[0]
-        local = self.array(primitive.attributes.POSITION).astype(float)
-        moved = Rotation.from_quat(keys["rotation"]).apply(local) + keys["translation"]
-        root = np.array(self.file.nodes[self.nodes["living_scene"]].matrix).reshape(4, 4).T  # by columns
-        y_up = moved @ root[:3, :3].T + root[:3, 3]
-        faces = None if primitive.indices is None else self.array(primitive.indices).reshape(-1, 3)
-        return y_up @ Z_UP_OF_Y_UP.T, faces
-
-
-def usd_shown(path: Path, name: str, scan: int):
-    pytest.importorskip("pxr.Usd")
-    from pxr import Usd, UsdGeom
-
-    stage = Usd.Stage.Open(str(path))  # a prim does not keep its stage alive
-    shape = stage.GetPrimAtPath(f"/scene/{name}/shape")
-    if UsdGeom.Imageable(shape).ComputeVisibility(scan) == "invisible":
-        return None
-    T = np.array(UsdGeom.Xformable(shape).ComputeLocalToWorldTransform(scan))  # row vectors
-    local = np.array(shape.GetAttribute("points").Get(), np.float64)
-    faces = shape.GetAttribute("faceVertexIndices").Get() if shape.IsA(UsdGeom.Mesh) else None
-    return (np.c_[local, np.ones(len(local))] @ T)[:, :3], None if faces is None else np.reshape(
-        faces, (-1, 3)
-    )
-
-
-def ply_shown(path: Path, number: int):
-    vertices = PlyData.read(str(path))["vertex"]
-    mine = np.asarray(vertices["object"]) == number
-    return (np.stack([vertices[a] for a in "xyz"], axis=-1)[mine], None) if mine.any() else None
-
-
-def json_shown(path: Path, o: SceneObject, scan: int):
-    """The file has poses only: the mesh in its reference frame is moved by the pose as documented."""
-    (stored,) = (e for e in json.loads(path.read_text())["objects"] if e["id"] == o.id)
-    poses = {seen["scan"]: np.linalg.inv(seen["T_ref_scan"]) for seen in stored["observations"]}
-    if scan not in poses:
-        return None
-    vertices, faces = (o.points, None) if o.mesh is None else (o.mesh.vertices, o.mesh.faces)
-    return trimesh.transform_points(vertices, poses[scan]), faces
-
-
-@pytest.fixture(scope="module")
-def exported(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("exported")
-    paths = {f: export_scene(ROOM, folder, f) for f in ("glb", "usd", "json")}
-    return paths | {("ply", s): export_scene(ROOM, folder / f"room{s}.ply", "ply", scan=s) for s in range(3)}
-
-
-@pytest.mark.parametrize("scan", [0, 1, 2])
-@pytest.mark.parametrize("format", ["glb", "usd", "ply", "json"])
-def test_every_format_puts_objects_on_the_points_the_scan_observed(exported, format, scan):
-    """`T_ref_scan` means the same everywhere: its inverse brings the reference onto the scan; absent is absent."""
-    for k, o in enumerate(ROOM.objects):
-        shown = {
-            "glb": lambda o=o: Gltf(exported["glb"]).shown(o.id, scan),
-            "usd": lambda o=o: usd_shown(exported["usd"], o.id, scan),
-            "ply": lambda k=k: ply_shown(exported["ply", scan], k),
-            "json": lambda o=o: json_shown(exported["json"], o, scan),
-        }[format]()
-        assert (shown is not None) == (scan in OBSERVED[o.id])
-        if shown is not None:
-            assert off_surface(*shown, OBSERVED[o.id][scan]) < LARGEST_M
-            others = [p for s, p in OBSERVED[o.id].items() if s != scan]
-            assert all(off_surface(*shown, p) > 0.1 for p in others)  # another scan's place is another place
 
 
 def test_pose_in_undoes_T_ref_scan():

@@ -21,9 +21,8 @@ from more2_jax.report.blob import Blob
 from more2_jax.report.coverage import coverage
 from more2_jax.report.palette import BASE, ink
 from more2_jax.report.payload import payload
-from more2_jax.report.thinning import simplified, thinned
 from more2_jax.report.wording import Verdict, headline, phrase, verdict
-from more2_jax.types import Changes, Mesh
+from more2_jax.types import Changes
 
 SCENE, CONFIG = living_scene(), SceneConfig()
 
@@ -270,25 +269,6 @@ def test_a_large_scene_is_thinned_and_keeps_to_its_size():
     assert sum(sum(shown["counts"]) for shown in data["objects"]) <= 500_002
     assert min(min(shown["counts"]) for shown in data["objects"]) >= 1
     assert len(text) < 5e6
-
-
-def test_thinning_keeps_an_even_sample():
-    cloud = np.random.default_rng(0).uniform(size=(10_000, 3))
-    few = thinned(cloud, 0.1)
-    assert len(few) == 1000
-    assert {tuple(p) for p in few} <= {tuple(p) for p in cloud}
-    assert np.abs(few[:100].mean(axis=0) - 0.5).max() < 0.1  # the first part of it is a sample too
-
-
-def test_simplified_mesh_is_near_the_whole():
-    import trimesh
-
-    ball = trimesh.creation.icosphere(5)
-    small = simplified(Mesh(vertices=ball.vertices, faces=ball.faces), 0.1)
-    assert 0.01 * len(ball.faces) < len(small.faces) <= 0.1 * len(ball.faces)
-    assert np.abs(np.linalg.norm(small.vertices, axis=1) - 1).max() < 0.05
-    assert small.faces.max() == len(small.vertices) - 1
-    assert simplified(cube(np.zeros(3)), 1.0).faces.shape == (12, 3)
 
 
 def test_coverage_of_a_cube_is_the_share_of_sides_seen():

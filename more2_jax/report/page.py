@@ -15,7 +15,7 @@ from more2_jax.report.payload import payload
 from more2_jax.types import LivingScene
 
 # In the order in which they need each other; all share one scope.
-PROGRAM = ("data", "room", "trails", "stage", "labels", "panel", "controls", "main")
+PROGRAM = ("data", "room", "trails", "pace", "stage", "labels", "panel", "controls", "main")
 TOGGLES = (  # name, what it says, on at first
     ("meshes", "Surfaces", True),
     ("clouds", "Points of this scan", True),

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import trimesh
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
@@ -14,9 +15,17 @@ from more2_jax.objects import points_of
 from more2_jax.report.blob import Blob
 from more2_jax.report.coverage import coverage
 from more2_jax.report.palette import color, ink
-from more2_jax.report.thinning import MOST_FACES, MOST_POINTS, share_of, simplified, thinned
+from more2_jax.report.thinning import (
+    MOST_COARSE_FACES,
+    MOST_FACES,
+    MOST_POINTS,
+    coarse_faces,
+    share_of,
+    simplified,
+    thinned,
+)
 from more2_jax.report.wording import Verdict, changes_from, doubts_of, headline, phrase, verdict
-from more2_jax.types import LivingScene, Observation, ScanRecord, SceneObject
+from more2_jax.types import LivingScene, Mesh, Observation, ScanRecord, SceneObject
 
 Point = Float[np.ndarray, "3"]
 
@@ -46,9 +55,10 @@ def payload(scene: LivingScene, config: SceneConfig) -> tuple[dict[str, Any], st
     middle = (low + high) / 2
     points = share_of(len(everything), MOST_POINTS)
     faces = share_of(sum(len(o.mesh.faces) for o in scene.objects if o.mesh is not None), MOST_FACES)
+    coarse = MOST_COARSE_FACES // len(scene.objects)
     return {
         "scans": [_scan(s, blob, points, middle) for s in scene.scans],
-        "objects": [_object(o, k, blob, points, faces, middle) for k, o in enumerate(scene.objects)],
+        "objects": [_object(o, k, blob, points, faces, coarse, middle) for k, o in enumerate(scene.objects)],
         "pairs": {f"{a}-{b}": _pair(scene, v, a, b) for (a, b), v in verdicts_of(scene, config).items()},
         "size": (high - low).tolist(),
         "share": {"points": points, "faces": faces},
@@ -78,7 +88,7 @@ def _scan(s: ScanRecord, blob: Blob, share: float, middle: Point) -> dict[str, A
 
 
 def _object(
-    o: SceneObject, number: int, blob: Blob, points: float, faces: float, middle: Point
+    o: SceneObject, number: int, blob: Blob, points: float, faces: float, coarse: int, middle: Point
 ) -> dict[str, Any]:
     """One object; its cloud and mesh relative to `anchor`, the mean of its points in the reference frame."""
     anchor = o.points.mean(axis=0)
@@ -94,17 +104,20 @@ def _object(
         "observations": [_observation(o, seen, anchor, middle) for seen in o.observations],
         "cloud": blob.add_points(np.concatenate(parts) - anchor),
         "counts": [len(p) for p in parts],
-        "mesh": None
-        if mesh is None
-        else {
-            "vertices": blob.add_points(mesh.vertices - anchor),
-            "faces": blob.add(mesh.faces.reshape(-1).astype(_index_type(len(mesh.vertices)))),
-        },
+        "mesh": None if mesh is None else _mesh(mesh, blob, anchor, coarse),
     }
 
 
-def _index_type(vertices: int) -> type[np.uint16] | type[np.uint32]:
-    return np.uint16 if vertices <= 65536 else np.uint32
+def _mesh(mesh: Mesh, blob: Blob, anchor: Point, most: int) -> dict[str, Any]:
+    """A surface, and a version of it with about `most` faces, on the same vertices, to be drawn while things move."""
+    index = np.uint16 if len(mesh.vertices) <= 65536 else np.uint32
+    solid = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+    return {
+        "vertices": blob.add_points(mesh.vertices - anchor),
+        "faces": blob.add(mesh.faces.reshape(-1).astype(index)),
+        "coarse": blob.add(coarse_faces(mesh, most).reshape(-1).astype(index)),
+        "closed": bool(solid.is_watertight and solid.volume > 0),
+    }
 
 
 def _observation(o: SceneObject, seen: Observation, anchor: Point, middle: Point) -> dict[str, Any]:

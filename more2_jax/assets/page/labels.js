@@ -20,23 +20,28 @@ class Labels {
 
   place() {
     const views = this.stage.state.toggles.labels ? this.stage.views() : [];
-    const selected = this.stage.state.selected;
+    const size = [this.stage.canvas.clientWidth, this.stage.canvas.clientHeight]; // read before anything is written
     for (const [side, tags] of this.tags.entries()) {
-      for (const [k, tag] of tags.entries()) {
-        const built = this.stage.builds[k];
-        const at = views[side] ? this.stage.project(built, views[side], built.top * 1.1 + 0.012 * this.stage.extent) : null;
-        tag.hidden = at === null || !this.inside(at, views[side]);
-        if (tag.hidden) continue;
-        const { id, number, name } = built.object;
-        tag.textContent = id !== selected ? number : name === `object ${number}` ? name : `${number} ${name}`;
-        tag.classList.toggle("off", selected !== null && id !== selected);
-        tag.style.transform = `translate(${Math.round(at.x)}px, ${Math.round(at.y)}px) translate(-50%, -100%)`;
-      }
+      for (const [k, tag] of tags.entries()) this.put(tag, this.stage.builds[k], views[side], size);
     }
   }
 
-  inside(at, view) {
-    const { clientWidth: w, clientHeight: h } = this.stage.canvas;
+  /** Writes only what changed: every write makes the browser lay out the tag anew. */
+  put(tag, built, view, size) {
+    const up = built.top * 1.1 + 0.012 * this.stage.extent;
+    const at = view ? this.stage.project(built, view, up, size) : null;
+    const hidden = at === null || !this.inside(at, view, size);
+    if (tag.hidden !== hidden) tag.hidden = hidden;
+    if (hidden) return;
+    const { id, number, name } = built.object;
+    const selected = this.stage.state.selected;
+    const text = id !== selected ? String(number) : name === `object ${number}` ? name : `${number} ${name}`;
+    if (tag.textContent !== text) tag.textContent = text;
+    tag.classList.toggle("off", selected !== null && id !== selected);
+    tag.style.transform = `translate(${Math.round(at.x)}px, ${Math.round(at.y)}px) translate(-50%, -100%)`;
+  }
+
+  inside(at, view, [w, h]) {
     const [u, v] = [at.x / w, 1 - at.y / h];
     return u >= view.x && u <= view.x + view.w && v >= view.y && v <= view.y + view.h;
   }

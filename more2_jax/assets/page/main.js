@@ -18,7 +18,6 @@ const more2 = {
   theme: "light",
   toggles: {},
   frames: 0, // drawn so far
-  frame_ms: null, // smoothed, while the view moves
 
   setTime(time) {
     const to = Math.min(lastScan, Math.max(0, Math.round(time)));
@@ -92,22 +91,23 @@ const more2 = {
     return built ? stage.project(built, stage.views().at(-1)) : null;
   },
 
-  /** Milliseconds a frame while turning, drawing waited for: median of `count`. Full quality, or as when dragged. */
+  /** True when the last change is drawn in full. */
+  get settled() {
+    return stage === null || stage.pace.settled;
+  },
+
+  /** The latest frames: [when it ended, milliseconds it took, level of quality]. */
+  paceLog: () => stage.pace.frames,
+
+  /** Milliseconds a frame while turning, at a level of quality, waited for: one number a frame. */
   async measure(count, level = 0) {
-    stage.setLevel(level);
-    const pixel = new Uint8Array(4);
-    const gl = stage.renderer.getContext();
     const times = [];
     for (let k = 0; k < count; k++) {
       stage.turn(0.03, 0);
-      const began = performance.now();
-      stage.draw();
-      gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, pixel);
-      times.push(performance.now() - began);
+      times.push(stage.pace.drawLevel(level));
       await new Promise((resolve) => setTimeout(resolve));
     }
-    stage.setLevel(0);
-    return times.sort((a, b) => a - b)[Math.floor(count / 2)];
+    return times;
   },
 };
 window.more2 = more2;
@@ -163,7 +163,7 @@ async function start() {
     stage = new Stage(canvas, more2);
     new Labels(document.getElementById("labels"), stage);
     stage.setTheme();
-    stage.draw();
+    stage.pace.frame();
     wait.hidden = true;
     const cell = stage.cell >= 1 ? `${stage.cell} m` : `${Math.round(100 * stage.cell)} cm`;
     document.getElementById("scale").textContent = `floor squares: ${cell}`;

@@ -19,15 +19,13 @@ function placeOnGrid(thing, reference) {
 function buildObject(object) {
   const group = new THREE.Group();
   const color = new THREE.Color(object.color);
-  const cloud = new THREE.Points(gridGeometry(object.cloud), new THREE.PointsMaterial({ size: 2, sizeAttenuation: false }));
+  const cloud = new THREE.Points(gridGeometry(object.cloud), [new THREE.PointsMaterial({ size: 2, sizeAttenuation: false })]);
   group.add(placeOnGrid(cloud, object.cloud));
-  const built = { object, group, cloud, color, mesh: null, ghost: null, trail: null, top: topOf(cloud, object.cloud) };
+  const top = topOf(cloud, object.cloud);
+  const built = { object, group, cloud, color, mesh: null, fine: null, coarse: null, ghost: null, trail: null, top };
   if (object.mesh) {
-    const geometry = gridGeometry(object.mesh.vertices);
-    geometry.setIndex(new THREE.BufferAttribute(arrayOf(object.mesh.faces), 1));
-    geometry.computeVertexNormals();
-    built.mesh = new THREE.Mesh(geometry, new THREE.MeshLambertMaterial({ side: THREE.DoubleSide }));
-    group.add(placeOnGrid(built.mesh, object.mesh.vertices));
+    buildMesh(built);
+    group.add(built.mesh);
     built.top = Math.max(built.top, topOf(built.mesh, object.mesh.vertices));
   }
   built.ghost = buildGhost(built);
@@ -36,13 +34,26 @@ function buildObject(object) {
   return built;
 }
 
+/** The surface, and the same with fewer faces on the same vertices. */
+function buildMesh(built) {
+  const { vertices, faces, coarse, closed } = built.object.mesh;
+  built.fine = gridGeometry(vertices);
+  built.fine.setIndex(new THREE.BufferAttribute(arrayOf(faces), 1));
+  built.fine.computeVertexNormals();
+  built.coarse = built.fine.clone();
+  built.coarse.attributes = built.fine.attributes; // one copy on the graphics card
+  built.coarse.setIndex(new THREE.BufferAttribute(arrayOf(coarse), 1));
+  const side = closed ? THREE.FrontSide : THREE.DoubleSide; // nobody sees a closed surface from within
+  built.mesh = placeOnGrid(new THREE.Mesh(built.fine, new THREE.MeshLambertMaterial({ side })), vertices);
+}
+
 /** The pale shape that shows where an object was. */
 function buildGhost(built) {
   const pale = { transparent: true, depthWrite: false, opacity: built.mesh ? 0.22 : 0.35, color: built.color };
   const ghost = new THREE.Group();
   ghost.add(
     built.mesh
-      ? placeOnGrid(new THREE.Mesh(built.mesh.geometry, new THREE.MeshLambertMaterial(pale)), built.object.mesh.vertices)
+      ? placeOnGrid(new THREE.Mesh(built.coarse, new THREE.MeshLambertMaterial(pale)), built.object.mesh.vertices)
       : placeOnGrid(new THREE.Points(built.cloud.geometry, new THREE.PointsMaterial({ ...pale, size: 2, sizeAttenuation: false })), built.object.cloud),
   );
   ghost.visible = false;
@@ -103,19 +114,29 @@ function poseObject(built, time, look) {
   built.group.position.copy(pose.position);
   built.group.quaternion.copy(pose.quaternion);
   showCloud(built, Math.round(time), look);
-  if (built.mesh) built.mesh.visible = look.toggles.meshes;
+  if (built.mesh) {
+    built.mesh.visible = look.toggles.meshes;
+    built.mesh.geometry = look.quality.coarse ? built.coarse : built.fine;
+  }
   paint(built, pose.strength, look);
 }
 
-/** Draws the points of one scan or of all: those of a scan follow each other in the buffer. */
+/** Draws the points of one scan or of all, or a share of each scan: a scan's points follow each other in the buffer. */
 function showCloud(built, scan, look) {
   const { counts, observations } = built.object;
   const all = look.toggles.accumulated;
-  const index = observations.findIndex((seen) => seen.scan === scan);
-  built.cloud.visible = all || (look.toggles.clouds && index >= 0);
-  const before = all ? 0 : counts.slice(0, Math.max(index, 0)).reduce((a, b) => a + b, 0);
-  const count = all ? counts.reduce((a, b) => a + b, 0) : (counts[index] ?? 0);
-  built.cloud.geometry.setDrawRange(before, Math.ceil(count * (all ? 1 : look.share)));
+  const shown = observations.findIndex((seen) => seen.scan === scan);
+  const { geometry } = built.cloud;
+  const hidden = look.quality.bare && built.mesh && look.toggles.meshes;
+  built.cloud.visible = !hidden && (all || (look.toggles.clouds && shown >= 0));
+  geometry.clearGroups();
+  let begin = 0;
+  for (const [k, count] of counts.entries()) {
+    if (k === shown && !all) geometry.setDrawRange(begin, count);
+    if (k === shown || all) geometry.addGroup(begin, Math.ceil(count * look.quality.points), 0);
+    begin += count;
+  }
+  if (all) geometry.setDrawRange(0, begin);
 }
 
 function fadingOf(built, look) {
@@ -132,15 +153,16 @@ function paintPast(built, look) {
 function paint(built, strength, look) {
   const chosen = look.selected === built.object.id;
   const faded = fadingOf(built, look);
-  const pointColor = built.cloud.material.color.copy(built.color);
-  if (built.mesh && look.toggles.meshes) pointColor.lerp(look.theme.ink, 0.35); // or they drown in the surface
-  pointColor.lerp(look.theme.ground, faded);
-  for (const part of built.mesh ? [built.mesh, built.cloud] : [built.cloud]) {
-    if (part.material.transparent !== strength < 1) {
-      part.material.transparent = strength < 1;
-      part.material.needsUpdate = true;
+  const [points] = built.cloud.material;
+  points.color.copy(built.color);
+  if (built.mesh && look.toggles.meshes) points.color.lerp(look.theme.ink, 0.35); // or they drown in the surface
+  points.color.lerp(look.theme.ground, faded);
+  for (const material of built.mesh ? [built.mesh.material, points] : [points]) {
+    if (material.transparent !== strength < 1) {
+      material.transparent = strength < 1;
+      material.needsUpdate = true;
     }
-    part.material.opacity = strength;
+    material.opacity = strength;
   }
   if (!built.mesh) return;
   built.mesh.material.color.copy(built.color).lerp(look.theme.ground, faded);

@@ -1,9 +1,4 @@
-// The camera, the canvas, what is drawn when, and what lies under the pointer.
-
-// While the view moves, a slow machine draws less: share of the pixels a side, share of the points.
-const QUALITY = [[1, 1], [0.75, 0.5], [0.5, 0.25], [0.35, 0.12]];
-const SLOW_MS = 45;
-const REST_MS = 220;
+// The camera, the canvas, and what lies under the pointer.
 
 class Stage {
   constructor(canvas, state) {
@@ -15,11 +10,12 @@ class Stage {
     this.camera.up.set(0, 0, 1);
     this.controls = new THREE.OrbitControls(this.camera, canvas);
     this.controls.maxPolarAngle = 0.495 * Math.PI; // not from below the floor
-    this.controls.addEventListener("change", () => this.moved());
+    this.controls.addEventListener("change", () => this.redraw());
     this.builds = scene.objects.map(buildObject);
     this.backgrounds = scene.scans.map(buildBackground);
     this.extent = Math.max(0.05, Math.hypot(...scene.size));
-    this.level = 0; // of QUALITY
+    this.quality = QUALITY[0];
+    this.pace = new Pace((quality) => this.drawIn(quality));
     this.trails = new THREE.Group();
     this.theme = { ink: new THREE.Color(), ground: new THREE.Color() };
     this.furnish();
@@ -64,7 +60,7 @@ class Stage {
   }
 
   resize() {
-    this.renderer.setPixelRatio(Math.min(devicePixelRatio, 2) * QUALITY[this.level][0]);
+    this.renderer.setPixelRatio(Math.min(devicePixelRatio, 2) * this.quality.pixels);
     this.renderer.setSize(this.canvas.clientWidth, this.canvas.clientHeight, false);
     this.redraw();
   }
@@ -106,16 +102,28 @@ class Stage {
 
   /** Puts everything where it stands in a view. */
   arrange(view) {
-    const share = QUALITY[this.level][1];
-    const look = { toggles: this.state.toggles, selected: this.state.selected, theme: this.theme, share };
+    const look = { toggles: this.state.toggles, selected: this.state.selected, theme: this.theme, quality: this.quality };
     for (const built of this.builds) {
       poseObject(built, view.time, look);
-      built.ghost.children[0].visible = view.trails;
+      built.ghost.children[0].visible = view.trails && !this.quality.bare;
     }
     this.trails.visible = view.trails && Number.isInteger(view.time);
     for (const [scan, cloud] of this.backgrounds.entries()) {
-      if (cloud) cloud.visible = look.toggles.background && scan === Math.round(view.time);
+      if (!cloud) continue;
+      cloud.visible = look.toggles.background && scan === Math.round(view.time);
+      cloud.geometry.setDrawRange(0, Math.ceil(cloud.geometry.attributes.position.count * this.quality.points));
     }
+  }
+
+  /** Draws at a quality and waits until it is drawn. */
+  drawIn(quality) {
+    if (quality.pixels !== this.quality.pixels) {
+      this.renderer.setPixelRatio(Math.min(devicePixelRatio, 2) * quality.pixels); // sets the size, too
+    }
+    this.quality = quality;
+    this.draw();
+    const gl = this.renderer.getContext();
+    gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, new Uint8Array(4));
   }
 
   draw() {
@@ -136,36 +144,7 @@ class Stage {
 
   /** Draws once, before the next frame. */
   redraw() {
-    if (this.pending) return;
-    this.pending = requestAnimationFrame((now) => {
-      this.pending = 0;
-      const since = now - (this.lastFrame ?? now);
-      if (since > 0 && since < 1000 && this.moving) this.adapt(since);
-      this.lastFrame = now;
-      this.draw();
-    });
-  }
-
-  /** The view was turned: coarser while that is slow, fine again at rest. */
-  moved() {
-    this.moving = true;
-    clearTimeout(this.rest);
-    this.rest = setTimeout(() => {
-      this.moving = false;
-      this.lastFrame = undefined;
-      if (this.level > 0) this.setLevel(0);
-    }, REST_MS);
-    this.redraw();
-  }
-
-  adapt(since) {
-    this.state.frame_ms = 0.6 * (this.state.frame_ms ?? since) + 0.4 * since;
-    if (this.state.frame_ms > SLOW_MS && this.level < QUALITY.length - 1) this.setLevel(this.level + 1);
-  }
-
-  setLevel(level) {
-    this.level = level;
-    this.resize();
+    this.pace.request();
   }
 
   /** Id of the object at a place of the canvas, pixels from its upper left corner, or null. */
@@ -185,10 +164,9 @@ class Stage {
   }
 
   /** Where a point above an object's anchor appears, canvas pixels; null behind the camera or absent. */
-  project(built, view, up = 0) {
+  project(built, view, up = 0, [w, h] = [this.canvas.clientWidth, this.canvas.clientHeight]) {
     const pose = poseAt(built.object, view.time);
     if (!pose) return null;
-    const { clientWidth: w, clientHeight: h } = this.canvas;
     const at = pose.position.clone();
     at.z += up;
     at.project(this.camera);
@@ -205,12 +183,12 @@ class Stage {
     offset.set(Math.cos(angle) * Math.cos(tilt), Math.sin(angle) * Math.cos(tilt), Math.sin(tilt)).setLength(away);
     this.camera.position.copy(this.controls.target).add(offset);
     this.controls.update();
-    this.moved();
+    this.redraw();
   }
 
   zoom(factor) {
     this.camera.position.sub(this.controls.target).multiplyScalar(factor).add(this.controls.target);
     this.controls.update();
-    this.moved();
+    this.redraw();
   }
 }

@@ -7,6 +7,7 @@ export {
   ConeGeometry,
   DirectionalLight,
   DoubleSide,
+  FrontSide,
   GridHelper,
   Group,
   HemisphereLight,

@@ -1,7 +1,7 @@
 // How objects came from where they were: pale shapes, arrows, rings of a turn.
 
 const TURN_SHOWN_DEG = 5;
-const TUBE = { sides: 8, along: 40 };
+const TUBE = { sides: 6, along: 28 };
 
 /** Arrows and rings of everything that moved between two scans; ghosts are shown where they stood. */
 function buildTrails(builds, from, to, pair, extent) {
@@ -70,17 +70,26 @@ function radiusOf(built) {
   return geometry.boundingSphere.radius * scale.x;
 }
 
-/** A tube along a curve with a head at its end; `paint` gives it the object's colour. */
+/** A tube along a curve with a head at its end, as one mesh; `paint` gives it the object's colour. */
 function arrow(curve, width, built) {
-  const group = new THREE.Group();
-  built.trail = new THREE.MeshBasicMaterial();
-  group.add(new THREE.Mesh(new THREE.TubeGeometry(curve, TUBE.along, width, TUBE.sides), built.trail));
-  const head = new THREE.Mesh(new THREE.ConeGeometry(4 * width, 11 * width, 16), built.trail);
+  const tube = new THREE.TubeGeometry(curve, TUBE.along, width, TUBE.sides);
+  const head = new THREE.ConeGeometry(4 * width, 11 * width, 12);
   const direction = curve.getTangent(1);
-  head.position.copy(curve.getPoint(1)).addScaledVector(direction, -5 * width);
-  head.quaternion.setFromUnitVectors(new THREE.Vector3(0, 1, 0), direction);
-  group.add(head);
-  return group;
+  const turn = new THREE.Quaternion().setFromUnitVectors(new THREE.Vector3(0, 1, 0), direction);
+  const end = curve.getPoint(1).addScaledVector(direction, -5 * width);
+  head.applyQuaternion(turn).translate(end.x, end.y, end.z);
+  built.trail = new THREE.MeshBasicMaterial();
+  return new THREE.Mesh(joined(tube, head), built.trail);
+}
+
+/** Two geometries as one: positions and faces. */
+function joined(a, b) {
+  const positions = [...a.attributes.position.array, ...b.attributes.position.array];
+  const shift = a.attributes.position.count;
+  const geometry = new THREE.BufferGeometry();
+  geometry.setAttribute("position", new THREE.BufferAttribute(new Float32Array(positions), 3));
+  geometry.setIndex([...a.index.array, ...[...b.index.array].map((k) => k + shift)]);
+  return geometry;
 }
 
 function disposeTrails(trails) {
