@@ -318,6 +318,17 @@ def test_flawed_samples_are_finite_and_keep_enough():
     assert sample.mask.sum(axis=-1).min() > 32
 
 
+def test_a_cloud_that_cuts_would_leave_nothing_of_stays_whole():
+    config = dataclasses.replace(UNFLAWED, ball_probability=1.0)
+    cut = jax.jit(jax.vmap(lambda key, views: partial_cloud(key, views, views, config, 200)[1], (0, None)))
+    views = shapes().views[3, :4]
+    small = cut(KEYS[:20], 0.05 * views).sum(
+        axis=1
+    )  # of radius 0.02: any ball about a point of it holds it all
+    assert small.min() > 100  # points drawn twice count once
+    assert (cut(KEYS[:20], views).sum(axis=1) < small).all()
+
+
 def test_samples_follow_the_shapes_when_these_are_permuted():
     data, key, order = shapes(), jax.random.key(2), np.array([2, 0, 3, 1])
     permuted = jax.tree.map(lambda a: a[order], data)

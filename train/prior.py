@@ -30,6 +30,7 @@ from more2_jax.prior import Prior, encode_ordered, init_prior, load_prior, save_
 from train.checkpoints import keep, open_checkpoints, resume
 from train.devices import agreed, connect, device_mesh, everywhere, here, is_first
 from train.journal import Journal
+from train.memory import keep_freed_memory
 from train.pictures import held_out
 from train.program import run
 from train.shape_mix import load_mix
@@ -80,6 +81,7 @@ def main(
         process: which of them this is.
     """
     deadline = time.monotonic() + 60 * minutes
+    keep_freed_memory()
     connect(coordinator, processes, process)
     settings, name = load_config(config, TrainingRun), name or config.stem
     first = started_warm(settings.model, warm_start, name) if warm_start else None

@@ -26,6 +26,8 @@ from more2_jax.data.stretching import stretched
 from more2_jax.geometry import farthest_points
 from more2_jax.types import pytree
 
+LEAST_KEPT = 0.1  # of the points: a cloud of which cuts would leave less stays whole
+
 
 @pytree
 class TrainingSample:
@@ -111,5 +113,7 @@ def partial_cloud(
     points = points + config.noise * jax.random.normal(keys[3], points.shape)
     kept = ~lost & ~half_space(keys[4], points, open_to_flaws * config.crop_probability)
     kept &= ~ball(keys[5], points, open_to_flaws * config.ball_probability)
+    # A shelf seen edge-on fits into a ball. What is left of it has no size, and the logarithm of its scale no slope.
+    kept = jnp.where(kept.sum() < LEAST_KEPT * len(points), True, kept)
     points, kept = add_junk(keys[6], points, kept, other, open_to_flaws * config.junk_probability)
     return farthest_points(*start_far_out(points, kept), count)
