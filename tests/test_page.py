@@ -6,7 +6,19 @@ import dataclasses
 import numpy as np
 import pytest
 from factories import living_scene, scene_object
-from page_browser import TOGGLES, click_on, differing, in_a_browser, like, pixels, room, state, until
+from page_browser import (
+    PHONE,
+    TOGGLES,
+    WIDE,
+    click_on,
+    differing,
+    in_a_browser,
+    like,
+    pixels,
+    room,
+    state,
+    until,
+)
 
 from more2_jax.config import SceneConfig
 from more2_jax.report import write_report
@@ -180,6 +192,31 @@ def test_before_and_after_stand_side_by_side(opened):
     left, right = np.array_split(view, 2, axis=1)
     assert like(left, 2) > 20 and like(right, 2) == 0
     assert like(left, 3) == 0 and like(right, 3) > 20
+
+
+CORNERS = """() => [0, 1, 2, 3, 4, 5, 6, 7].map((k) => {
+  const c = new THREE.Vector3(...scene.size.map((length, axis) => (k & (1 << axis) ? 0.5 : -0.5) * length));
+  const { x, y } = c.project(stage.camera);
+  return [x, y];
+})"""
+
+
+@pytest.mark.parametrize("split", [False, True])
+@pytest.mark.parametrize("viewport", [WIDE, PHONE], ids=["wide", "phone"])
+def test_at_first_the_room_fills_the_view(opened, viewport, split):
+    """All corners of its box lie in the picture, -1 to 1, and touch the margin on two opposite sides."""
+    page = opened()
+    page.set_viewport_size(viewport)
+    page.evaluate(f"more2.toggle('split', {str(split).lower()})")
+    pixels(page)
+    page.evaluate("more2.home()")
+    pixels(page)
+    corners = np.array(page.evaluate(CORNERS))
+    page.set_viewport_size(WIDE)
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    assert low.min() > -1 and high.max() < 1
+    tight = (high - low).argmax()
+    assert (low[tight], high[tight]) == pytest.approx((-1 / 1.08, 1 / 1.08), abs=0.01)
 
 
 def test_dragging_turns_and_does_not_select(opened):

@@ -38,6 +38,7 @@ class Labels {
     const text = id !== selected ? String(number) : name === `object ${number}` ? name : `${number} ${name}`;
     if (tag.textContent !== text) tag.textContent = text;
     tag.classList.toggle("off", selected !== null && id !== selected);
+    tag.classList.toggle("chosen", id === selected);
     tag.style.transform = `translate(${Math.round(at.x)}px, ${Math.round(at.y)}px) translate(-50%, -100%)`;
   }
 

@@ -1,5 +1,7 @@
 // The camera, the canvas, and what lies under the pointer.
 
+const ROOM_AROUND = 1.08;
+
 class Stage {
   constructor(canvas, state) {
     this.canvas = canvas;
@@ -36,11 +38,16 @@ class Stage {
     for (const cloud of this.backgrounds) if (cloud) this.world.add(cloud);
   }
 
-  /** The view from which the whole room is seen. */
+  /** The nearest view from this side that holds all corners of the room. */
   home() {
-    const away = this.extent * 1.03 * Math.max(1, 1.15 / this.aspect()); // narrow views see less to the sides
-    this.controls.target.set(0, 0, -0.25 * scene.size[2]);
-    this.camera.position.set(-0.55, -0.95, 0.85).setLength(away).add(this.controls.target);
+    const back = new THREE.Vector3(-0.55, -0.95, 0.85).normalize();
+    const right = new THREE.Vector3(0, 0, 1).cross(back).normalize();
+    const up = back.clone().cross(right);
+    const rise = Math.tan((this.camera.fov * Math.PI) / 360) / ROOM_AROUND;
+    const [a, b] = [reach(right, back, rise * this.aspect()), reach(up, back, rise)];
+    const middle = right.clone().multiplyScalar(a.middle).addScaledVector(up, b.middle);
+    this.controls.target.copy(middle);
+    this.camera.position.copy(middle).addScaledVector(back, Math.max(a.away, b.away));
     this.camera.near = this.extent / 500;
     this.camera.far = this.extent * 20;
     this.controls.maxDistance = this.extent * 6;
@@ -191,4 +198,16 @@ class Stage {
     this.controls.update();
     this.redraw();
   }
+}
+
+/**
+ * How far back a camera must stand, and how far to the side, so that along one direction of its picture every corner of
+ * the room lies within `slope` to either side.
+ */
+function reach(side, back, slope) {
+  const corners = [0, 1, 2, 3, 4, 5, 6, 7].map((k) =>
+    new THREE.Vector3(...scene.size.map((length, axis) => (k & (1 << axis) ? 0.5 : -0.5) * length)));
+  const high = Math.max(...corners.map((c) => c.dot(side) + slope * c.dot(back)));
+  const low = Math.max(...corners.map((c) => -c.dot(side) + slope * c.dot(back)));
+  return { away: Math.max((high + low) / (2 * slope), 1e-3), middle: (high - low) / 2 };
 }
