@@ -117,7 +117,7 @@ def opened(opener, request, said):
         return page
 
     yield opening
-    assert said == []
+    assert said == [], said
 
 
 def until(page, condition: str) -> None:

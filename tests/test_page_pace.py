@@ -7,7 +7,7 @@ pytestmark = in_a_browser
 
 # Frames asked for without a pause for half a second, of a machine that takes `cost[level]` ms for a frame.
 MOVE = """async (cost) => {
-  const pace = new Pace((quality) => {
+  const pace = new Pace(async (quality) => {
     const end = performance.now() + cost[QUALITY.indexOf(quality)];
     while (performance.now() < end);
   });

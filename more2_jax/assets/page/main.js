@@ -102,11 +102,14 @@ const more2 = {
   /** Milliseconds a frame while turning, at a level of quality, waited for: one number a frame. */
   async measure(count, level = 0) {
     const times = [];
+    stage.pace.busy = true; // no other frames meanwhile
     for (let k = 0; k < count; k++) {
       stage.turn(0.03, 0);
-      times.push(stage.pace.drawLevel(level));
+      times.push(await stage.pace.drawLevel(level));
       await new Promise((resolve) => setTimeout(resolve));
     }
+    stage.pace.busy = false;
+    stage.redraw();
     return times;
   },
 };
@@ -163,7 +166,7 @@ async function start() {
     stage = new Stage(canvas, more2);
     new Labels(document.getElementById("labels"), stage);
     stage.setTheme();
-    stage.pace.frame();
+    await new Promise(requestAnimationFrame); // the first frame was asked for before
     wait.hidden = true;
     const cell = stage.cell >= 1 ? `${stage.cell} m` : `${Math.round(100 * stage.cell)} cm`;
     document.getElementById("scale").textContent = `floor squares: ${cell}`;

@@ -14,45 +14,55 @@ const REST_MS = 250;
 const KEPT_FRAMES = 600;
 
 class Pace {
-  /** `draw(quality)` draws a frame and waits for it: only so is its time known. */
+  /** `draw(quality)` draws a frame and promises to say when it is drawn: only so is its time known. */
   constructor(draw) {
     this.drawNow = draw;
     this.cost = []; // milliseconds of the last frame of each level of QUALITY
     this.level = null; // of the last frame
-    this.pending = 0;
+    this.asked = false; // for a frame after the one being drawn
+    this.busy = false; // from the wish for a frame until it is drawn
     this.frames = []; // the latest: [when it ended, milliseconds it took, level]
   }
 
   /** True when the last change is drawn in full. */
   get settled() {
-    return !this.pending && this.level === 0;
+    return !this.busy && this.level === 0;
   }
 
   /** Something changed: one frame before the next refresh of the screen, all of it once nothing changes any more. */
   request() {
     clearTimeout(this.rest);
     this.full = false;
-    this.pending ||= requestAnimationFrame(() => this.frame());
+    this.ask();
   }
 
-  frame() {
-    this.pending = 0;
+  ask() {
+    this.asked = true;
+    if (this.busy) return;
+    this.busy = true;
+    requestAnimationFrame(() => this.frame());
+  }
+
+  async frame() {
+    this.asked = false;
     const first = this.level === null;
     this.level = this.full ? 0 : this.affordable();
-    this.drawLevel(this.level);
-    if (this.level > 0) this.rest = setTimeout(() => this.settle(), first ? 0 : REST_MS);
+    await this.drawLevel(this.level);
+    this.busy = false;
+    if (this.asked) this.ask();
+    else if (this.level > 0) this.rest = setTimeout(() => this.settle(), first ? 0 : REST_MS);
   }
 
   settle() {
     this.cost = [];
     this.full = true;
-    this.pending ||= requestAnimationFrame(() => this.frame());
+    this.ask();
   }
 
-  /** Draws at a level of QUALITY; returns milliseconds. */
-  drawLevel(level) {
+  /** Draws at a level of QUALITY; milliseconds. */
+  async drawLevel(level) {
     const began = performance.now();
-    this.drawNow(QUALITY[level]);
+    await this.drawNow(QUALITY[level]);
     const ended = performance.now();
     this.cost[level] = ended - began;
     this.frames.push([ended, ended - began, level]);

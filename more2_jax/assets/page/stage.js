@@ -122,15 +122,29 @@ class Stage {
     }
   }
 
-  /** Draws at a quality and waits until it is drawn. */
+  /** Draws at a quality; the promise is kept when it is drawn. */
   drawIn(quality) {
     if (quality.pixels !== this.quality.pixels) {
       this.renderer.setPixelRatio(Math.min(devicePixelRatio, 2) * quality.pixels); // sets the size, too
     }
     this.quality = quality;
     this.draw();
+    return this.drawn();
+  }
+
+  /** Waits for the graphics card; the page goes on meanwhile. */
+  drawn() {
     const gl = this.renderer.getContext();
-    gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, new Uint8Array(4));
+    const fence = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
+    gl.flush();
+    return new Promise((done) => {
+      const look = () => {
+        if (!gl.isContextLost() && gl.getSyncParameter(fence, gl.SYNC_STATUS) !== gl.SIGNALED) return setTimeout(look);
+        gl.deleteSync(fence);
+        done();
+      };
+      look();
+    });
   }
 
   draw() {
