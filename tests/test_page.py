@@ -195,7 +195,7 @@ def test_before_and_after_stand_side_by_side(opened):
 
 
 CORNERS = """() => [0, 1, 2, 3, 4, 5, 6, 7].map((k) => {
-  const c = new THREE.Vector3(...scene.size.map((length, axis) => (k & (1 << axis) ? 0.5 : -0.5) * length));
+  const c = new THREE.Vector3(...[0, 1, 2].map((axis) => (k & (1 << axis) ? scene.box.high : scene.box.low)[axis]));
   const { x, y } = c.project(stage.camera);
   return [x, y];
 })"""
@@ -204,7 +204,7 @@ CORNERS = """() => [0, 1, 2, 3, 4, 5, 6, 7].map((k) => {
 @pytest.mark.parametrize("split", [False, True])
 @pytest.mark.parametrize("viewport", [WIDE, PHONE], ids=["wide", "phone"])
 def test_at_first_the_room_fills_the_view(opened, viewport, split):
-    """All corners of its box lie in the picture, -1 to 1, and touch the margin on two opposite sides."""
+    """All corners of the objects' box lie in the picture, -1 to 1, and touch the margin on two opposite sides."""
     page = opened()
     page.set_viewport_size(viewport)
     page.evaluate(f"more2.toggle('split', {str(split).lower()})")

@@ -50,7 +50,8 @@ def payload(scene: LivingScene, config: SceneConfig) -> tuple[dict[str, Any], st
     """
     blob = Blob()
     clouds = [points_of(o, seen) for o in scene.objects for seen in o.observations]
-    everything = np.concatenate([*clouds, *(s.background for s in scene.scans)])
+    objects = np.concatenate(clouds)
+    everything = np.concatenate([objects, *(s.background for s in scene.scans)])
     low, high = everything.min(axis=0), everything.max(axis=0)
     middle = (low + high) / 2
     points = share_of(len(everything), MOST_POINTS)
@@ -61,6 +62,10 @@ def payload(scene: LivingScene, config: SceneConfig) -> tuple[dict[str, Any], st
         "objects": [_object(o, k, blob, points, faces, coarse, middle) for k, o in enumerate(scene.objects)],
         "pairs": {f"{a}-{b}": _pair(scene, v, a, b) for (a, b), v in verdicts_of(scene, config).items()},
         "size": (high - low).tolist(),
+        "box": {
+            "low": (objects.min(axis=0) - middle).tolist(),
+            "high": (objects.max(axis=0) - middle).tolist(),
+        },
         "share": {"points": points, "faces": faces},
     }, blob.text()
 

@@ -28,7 +28,7 @@ class Labels {
 
   /** Writes only what changed: every write makes the browser lay out the tag anew. */
   put(tag, built, view, size) {
-    const up = built.top * 1.1 + 0.012 * this.stage.extent;
+    const up = built.top * 1.03 + (built.trail ? 0.042 : 0.014) * this.stage.extent; // over the arrow's head
     const at = view ? this.stage.project(built, view, up, size) : null;
     const hidden = at === null || !this.inside(at, view, size);
     if (tag.hidden !== hidden) tag.hidden = hidden;

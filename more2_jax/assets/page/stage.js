@@ -38,7 +38,7 @@ class Stage {
     for (const cloud of this.backgrounds) if (cloud) this.world.add(cloud);
   }
 
-  /** The nearest view from this side that holds all corners of the room. */
+  /** The nearest view that holds the box of all objects in all scans; walls and stray points may lie outside. */
   home() {
     const back = new THREE.Vector3(-0.55, -0.95, 0.85).normalize();
     const right = new THREE.Vector3(0, 0, 1).cross(back).normalize();
@@ -46,7 +46,8 @@ class Stage {
     const rise = Math.tan((this.camera.fov * Math.PI) / 360) / ROOM_AROUND;
     const [a, b] = [reach(right, back, rise * this.aspect()), reach(up, back, rise)];
     const middle = right.clone().multiplyScalar(a.middle).addScaledVector(up, b.middle);
-    this.controls.target.copy(middle);
+    const depth = new THREE.Vector3(...scene.box.low).add(new THREE.Vector3(...scene.box.high)).dot(back) / 2;
+    this.controls.target.copy(middle).addScaledVector(back, depth);
     this.camera.position.copy(middle).addScaledVector(back, Math.max(a.away, b.away));
     this.camera.near = this.extent / 500;
     this.camera.far = this.extent * 20;
@@ -216,11 +217,11 @@ class Stage {
 
 /**
  * How far back a camera must stand, and how far to the side, so that along one direction of its picture every corner of
- * the room lies within `slope` to either side.
+ * the objects' box lies within `slope` to either side.
  */
 function reach(side, back, slope) {
   const corners = [0, 1, 2, 3, 4, 5, 6, 7].map((k) =>
-    new THREE.Vector3(...scene.size.map((length, axis) => (k & (1 << axis) ? 0.5 : -0.5) * length)));
+    new THREE.Vector3(...[0, 1, 2].map((axis) => (k & (1 << axis) ? scene.box.high : scene.box.low)[axis])));
   const high = Math.max(...corners.map((c) => c.dot(side) + slope * c.dot(back)));
   const low = Math.max(...corners.map((c) => -c.dot(side) + slope * c.dot(back)));
   return { away: Math.max((high + low) / (2 * slope), 1e-3), middle: (high - low) / 2 };
