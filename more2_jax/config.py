@@ -126,6 +126,9 @@ class MeshingConfig:
     level: Literal["zero", "observed"] = (
         "zero"  # which level is the surface: 0, or the field's median at the points
     )
+    seen_reach: float = (
+        0.0  # canonical units: nearer to a seen point the surface runs through such points. 0: never
+    )
     half_width: float = 0.65  # of the query box, canonical units; objects are turned in it, so more than 0.55
 
 
@@ -225,7 +228,7 @@ def preset(name: str, *, upright: bool = False) -> SceneConfig:
                 icp_steps=12,
                 trim=0.7,
             ),
-            meshing=MeshingConfig(coarse=16, resolution=64, level="observed"),
+            meshing=MeshingConfig(coarse=16, resolution=64, level="observed", seen_reach=0.02),
             joint=JointConfig(points=128, start="accumulated", steps=40, eqv_learning_rate=1e-3),
         )
     raise ValueError(f"preset {name!r}; needed 'paper' or 'robust'")

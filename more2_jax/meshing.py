@@ -4,21 +4,26 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+from collections.abc import Callable
+from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 from jaxtyping import Bool, Float
 from scipy.ndimage import binary_dilation, zoom
 from skimage.measure import marching_cubes
 
 from more2_jax.config import MeshingConfig
 from more2_jax.prior import Prior, sdf_one
+from more2_jax.seen_surface import SeenSurface, seen_surface, some_of
 from more2_jax.types import Embedding, Mesh
 
 CHUNK = 8192  # queries a call: one compiled program for every object and resolution
 
 _values = jax.jit(sdf_one)
+_slopes = jax.jit(jax.grad(lambda *asked: sdf_one(*asked).sum(), argnums=2))
 
 
 def extract_mesh(
@@ -27,11 +32,13 @@ def extract_mesh(
     config: MeshingConfig,
     half_width: float | None = None,
     level: float = 0.0,
+    seen: Float[np.ndarray, "n 3"] | None = None,
 ) -> Mesh | None:
     """A level set of one object's field, by default 0; metres in its scan's frame, always closed.
 
-    `half_width` (canonical units) is half the edge of the query box. Returns None when the field stays above
-    `level` in the box: there is no surface to show. Raises ValueError unless `resolution` is `coarse` doubled
+    `half_width` (canonical units) is half the edge of the query box. With `seen`, points of the surface in the
+    scan's frame, and a `config.seen_reach`, the surface runs through them. Returns None when the field stays
+    above `level` in the box: there is no surface to show. Raises ValueError unless `resolution` is `coarse` doubled
     some times.
     """
     doublings = np.log2(config.resolution / config.coarse)
@@ -40,20 +47,34 @@ def extract_mesh(
             f"resolution {config.resolution} from coarse {config.coarse}; needed a power of two times it"
         )
     half = half_width or config.half_width
-    values = _evaluate(prior, embedding, _grid(config.coarse, half)).reshape([config.coarse + 1] * 3) - level
+    field = partial(_evaluate, prior, embedding, level, surface_through(prior, embedding, seen, config))
+    values = field(_grid(config.coarse, half)).reshape([config.coarse + 1] * 3)
     while len(values) - 1 < config.resolution:
-        values = _refine(prior, embedding, values, half, level)
+        values = _refine(field, values, half)
     if not (values < 0).any():
         return None
     return _surface(values, embedding, 2 * half / (len(values) - 1), half)
 
 
+def surface_through(
+    prior: Prior, embedding: Embedding, seen: Float[np.ndarray, "n 3"] | None, config: MeshingConfig
+) -> SeenSurface | None:
+    """What was seen, as planes around the points. None if nothing was, or it is not asked for."""
+    if seen is None or not config.seen_reach:
+        return None
+    points = canonical(embedding, some_of(seen))
+    return seen_surface(points, _in_chunks(_slopes, prior, embedding, points), config.seen_reach)
+
+
 def observed_level(prior: Prior, embedding: Embedding, points: Float[np.ndarray, "n 3"]) -> float:
     """The field's median at points (scan's frame) known to lie on the surface, canonical units; 0.1 at most."""
-    some = points[np.linspace(0, len(points) - 1, min(len(points), CHUNK)).astype(int)]
-    center = np.asarray(embedding.center, np.float64) + np.asarray(embedding.origin)
-    values = _evaluate(prior, embedding, (some - center) / float(embedding.scale))
+    values = _evaluate(prior, embedding, 0.0, None, canonical(embedding, some_of(points)))
     return float(np.clip(np.median(values), -0.1, 0.1))
+
+
+def canonical(embedding: Embedding, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    """Points of the scan's frame in canonical units, relative to the object's centre."""
+    return (points - np.asarray(embedding.center, np.float64) - embedding.origin) / float(embedding.scale)
 
 
 def _grid(cells: int, half: float) -> Float[np.ndarray, "p 3"]:
@@ -62,19 +83,36 @@ def _grid(cells: int, half: float) -> Float[np.ndarray, "p 3"]:
 
 
 def _evaluate(
-    prior: Prior, embedding: Embedding, canonical: Float[np.ndarray, "p 3"]
+    prior: Prior,
+    embedding: Embedding,
+    level: float,
+    seen: SeenSurface | None,
+    queries: Float[np.ndarray, "p 3"],
 ) -> Float[np.ndarray, " p"]:
-    """Field at canonical offsets from the centre, in chunks of one fixed size."""
+    """Field at canonical offsets from the centre, less `level`, drawn towards what was seen."""
+    values = _in_chunks(_values, prior, embedding, queries) - level
+    return values if seen is None else seen.corrected(queries, values)
+
+
+def _in_chunks(
+    of: Callable[[Prior, Embedding, Array], Array],
+    prior: Prior,
+    embedding: Embedding,
+    queries: Float[np.ndarray, "p 3"],
+) -> Float[np.ndarray, "p *_"]:
+    """What `of` gives at canonical offsets, asked for in chunks of one fixed size."""
     local = dataclasses.replace(embedding, origin=jnp.zeros(3))
-    points = (canonical * float(embedding.scale) + np.asarray(embedding.center)).astype(np.float32)
-    padded = np.zeros((-(-len(points) // CHUNK) * CHUNK, 3), np.float32)
+    points = (queries * float(embedding.scale) + np.asarray(embedding.center)).astype(np.float32)
+    padded = np.zeros((-(-max(len(points), 1) // CHUNK) * CHUNK, 3), np.float32)
     padded[: len(points)] = points
-    parts = [np.asarray(_values(prior, local, jnp.asarray(chunk))) for chunk in padded.reshape(-1, CHUNK, 3)]
-    return np.concatenate(parts)[: len(points)] if len(points) else np.zeros(0, np.float32)
+    parts = [np.asarray(of(prior, local, jnp.asarray(chunk))) for chunk in padded.reshape(-1, CHUNK, 3)]
+    return np.concatenate(parts)[: len(points)]
 
 
 def _refine(
-    prior: Prior, embedding: Embedding, coarse: Float[np.ndarray, "n n n"], half: float, level: float
+    field: Callable[[Float[np.ndarray, "p 3"]], Float[np.ndarray, " p"]],
+    coarse: Float[np.ndarray, "n n n"],
+    half: float,
 ) -> Float[np.ndarray, "m m m"]:
     """The grid with half the step: evaluated near the surface, interpolated elsewhere."""
     cells = 2 * (len(coarse) - 1)
@@ -85,7 +123,7 @@ def _refine(
     for step in itertools.product(range(3), repeat=3):
         fine[tuple((corners + step).T)] = True
     fine[::2, ::2, ::2] = False  # known from the coarse grid
-    values[fine] = _evaluate(prior, embedding, np.argwhere(fine) * (2 * half / cells) - half) - level
+    values[fine] = field(np.argwhere(fine) * (2 * half / cells) - half)
     return values
 
 
@@ -104,7 +142,7 @@ def _surface(values: Float[np.ndarray, "m m m"], embedding: Embedding, step: flo
     # A ring of outside around the box closes surfaces that reach its border.
     padded = np.pad(values, 1, constant_values=max(float(values.max()), step))
     vertices, faces, _, _ = marching_cubes(padded, 0.0, gradient_direction="descent")
-    canonical = (vertices - 1) * step - half
+    offsets = (vertices - 1) * step - half
     origin = np.asarray(embedding.origin, np.float64)
-    placed = canonical * float(embedding.scale) + np.asarray(embedding.center, np.float64) + origin
+    placed = offsets * float(embedding.scale) + np.asarray(embedding.center, np.float64) + origin
     return Mesh(vertices=placed.astype(np.float64), faces=faces.astype(np.int64))

@@ -103,7 +103,7 @@ def mesh_of(prior: Prior, o: SceneObject, config: SceneConfig) -> Mesh | None:
     `level` "observed": seen points lie on the surface, so the field's median there is its bias, and is taken off.
     """
     level = observed_level(prior, o.embedding, o.points) if config.meshing.level == "observed" else 0.0
-    return extract_mesh(prior, o.embedding, config.meshing, box_half_width(o, config), level)
+    return extract_mesh(prior, o.embedding, config.meshing, box_half_width(o, config), level, o.points)
 
 
 def box_half_width(o: SceneObject, config: SceneConfig) -> float:

@@ -33,6 +33,7 @@ LAYERS = {
         "matching",
         "surface_registration",
         "registration",
+        "seen_surface",
         "meshing",
         "joint",
     ),

@@ -170,7 +170,7 @@ def test_the_decoder_itself_gives_a_closed_mesh_or_none(tiny_prior):
         eqv=rng.normal(size=(3, 16)).astype(np.float32),
     )
     config = MeshingConfig(coarse=8, resolution=16)
-    values = meshing._evaluate(tiny_prior, code, meshing._grid(8, config.half_width))
+    values = meshing._evaluate(tiny_prior, code, 0.0, None, meshing._grid(8, config.half_width))
     mesh = extract_mesh(tiny_prior, code, config, level=float(np.median(values)))
     assert mesh is not None and solid(mesh).is_watertight
     assert extract_mesh(tiny_prior, code, config, level=float(values.min()) - 10.0) is None

@@ -1,0 +1,75 @@
+"""The surface where it was seen: beside observed points they, not the code, say where it runs.
+
+Beyond the paper. A code and a few hundred anchors keep a piece's shape, not the millimetres of the points they came
+from. So near them the field gives way to the distance from the planes that neighbouring points lie in (implicit
+moving least squares); which side of a plane is inside, the points do not say, and the field's slope decides. Farther
+away the field alone goes on: what nobody saw is still completed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial import KDTree
+
+NEIGHBOURS = 12  # points of a plane
+ASKED = 8  # planes a query hears
+MOST = 4096  # points that are kept
+GAP = 3.0  # median distances between neighbours
+LEAST_GAP = 1e-3  # canonical units; where points are doubled
+FEWEST = NEIGHBOURS + 1  # fewer make no surface
+
+Points = Float[np.ndarray, "_ 3"]
+
+
+@dataclass(frozen=True)
+class SeenSurface:
+    """Planes through neighbouring points, oriented; canonical units, relative to the object's centre."""
+
+    tree: KDTree  # of the points the planes belong to
+    center: Points  # of each plane: its points' mean, which has less of their noise
+    normal: Points  # unit length, outward
+    reach: float  # off a plane, at this distance, its say has fallen to 1/e
+    gap: float  # and along it, at this distance from the nearest point: it also holds between neighbours
+
+    def corrected(self, queries: Points, field: Float[np.ndarray, " _"]) -> Float[np.ndarray, " _"]:
+        """Field values at queries, drawn towards the distance from the planes; signed, canonical units."""
+        result = np.array(field, np.float64)
+        # The nearest alone first: most of a grid is out of reach, and stays as it is.
+        farthest = 2 * float(np.hypot(self.reach, self.gap))
+        near = np.flatnonzero(self.tree.query(queries, distance_upper_bound=farthest)[0] < np.inf)
+        if not len(near):
+            return result
+        distance, index = self.tree.query(queries[near], k=ASKED)
+        offset = np.einsum("qki,qki->qk", queries[near, None] - self.center[index], self.normal[index])
+        closeness = np.exp(-0.5 * (distance**2 - distance[:, :1] ** 2) / self.gap**2)
+        plane = (closeness * offset).sum(axis=1) / closeness.sum(axis=1)
+        # Flat at first: a field whose surface is a centimetre off must not draw this one towards it.
+        along = np.maximum(distance[:, 0] ** 2 - plane**2, 0.0)
+        say = np.exp(-((plane / self.reach) ** 4) - (along / self.gap**2) ** 2)
+        result[near] += say * (plane - result[near])
+        return result
+
+
+def some_of(points: Points) -> Points:
+    """At most `MOST` of the points, at even steps."""
+    return points[np.linspace(0, len(points) - 1, min(len(points), MOST)).astype(int)]
+
+
+def seen_surface(points: Points, slope: Points, reach: float) -> SeenSurface | None:
+    """Planes through each point's neighbours, outward where the field rises. None if there are too few points.
+
+    `slope` is the field's gradient at the points; both in canonical units, relative to the object's centre.
+    """
+    if len(points) < FEWEST:
+        return None
+    tree = KDTree(points)
+    apart, neighbours = tree.query(points, k=NEIGHBOURS)
+    center = points[neighbours].mean(axis=1)
+    offset = points[neighbours] - center[:, None]
+    normal = np.linalg.eigh(np.einsum("nki,nkj->nij", offset, offset))[1][:, :, 0]
+    outward = np.einsum("ni,nki->n", normal, slope[neighbours])
+    gap = GAP * max(float(np.median(apart[:, 1])), LEAST_GAP)
+    return SeenSurface(tree, center, np.where(outward < 0, -1.0, 1.0)[:, None] * normal, reach, gap)

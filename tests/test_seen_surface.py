@@ -1,0 +1,131 @@
+"""What was seen: the surface runs through it, the rest stays the field's; nothing depends on the frame."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from more2_jax import meshing
+from more2_jax.config import MeshingConfig
+from more2_jax.meshing import extract_mesh
+from more2_jax.seen_surface import FEWEST, MOST, seen_surface, some_of
+from more2_jax.types import Embedding
+
+REACH = 0.03
+CONFIG = MeshingConfig(coarse=16, resolution=64, seen_reach=REACH)
+PIECE = Embedding(
+    inv=np.zeros(4, np.float32),
+    eqv=np.zeros((3, 4), np.float32),
+    scale=np.float32(2.0),
+    center=np.array([0.1, -0.2, 0.05], np.float32),
+    origin=np.array([1000.0, -2000.0, 5.0]),
+)
+
+
+def sphere(count, radius, seed=0):
+    p = np.random.default_rng(seed).normal(size=(count, 3))
+    return radius * p / np.linalg.norm(p, axis=1, keepdims=True)
+
+
+def in_scan(canonical):
+    return 2.0 * canonical + PIECE.center.astype(np.float64) + PIECE.origin
+
+
+def in_canonical(points):
+    return (points - PIECE.center.astype(np.float64) - PIECE.origin) / 2.0
+
+
+@pytest.fixture
+def ball_of_036(monkeypatch):
+    """The decoder believes in a ball of radius 0.36."""
+
+    def offset(embedding, points):
+        return (np.asarray(points, np.float64) - np.asarray(embedding.center)) / 2.0
+
+    def values(prior, embedding, points):
+        return jnp.asarray(np.linalg.norm(offset(embedding, points), axis=1) - 0.36, jnp.float32)
+
+    def slopes(prior, embedding, points):
+        q = offset(embedding, points)
+        return jnp.asarray(q / np.maximum(np.linalg.norm(q, axis=1, keepdims=True), 1e-9), jnp.float32)
+
+    monkeypatch.setattr(meshing, "_values", values)
+    monkeypatch.setattr(meshing, "_slopes", slopes)
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.005])
+def test_the_mesh_runs_through_what_was_seen_and_follows_the_field_elsewhere(ball_of_036, tiny_prior, noise):
+    upper = sphere(4000, 0.4)
+    upper = upper[upper[:, 2] > 0]
+    seen = upper + noise * np.random.default_rng(1).normal(size=upper.shape)
+    mesh = extract_mesh(tiny_prior, PIECE, CONFIG, seen=in_scan(seen))
+    assert trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).is_watertight
+    p = in_canonical(mesh.vertices)
+    radius, height = np.linalg.norm(p, axis=1), p[:, 2]
+    # Where nothing was seen the ball goes on; between the two there is a step, which is what the reach blurs.
+    np.testing.assert_allclose(radius[height < -0.1], 0.36, atol=0.005)
+    assert abs(np.median(radius[height > 0.1]) - 0.4) < 0.004 and radius[height > 0.1].max() < 0.42
+    found = trimesh.Trimesh(p, mesh.faces, process=False).sample(20_000, seed=0)
+    assert cKDTree(found).query(upper)[0].max() < 0.03
+    alone = extract_mesh(tiny_prior, PIECE, MeshingConfig(coarse=16, resolution=64), seen=in_scan(seen))
+    np.testing.assert_allclose(np.linalg.norm(in_canonical(alone.vertices), axis=1), 0.36, atol=0.005)
+
+
+def test_too_few_points_leave_the_field_alone(ball_of_036, tiny_prior):
+    seen = in_scan(sphere(FEWEST - 1, 0.4))
+    mesh = extract_mesh(tiny_prior, PIECE, CONFIG, seen=seen)
+    np.testing.assert_allclose(np.linalg.norm(in_canonical(mesh.vertices), axis=1), 0.36, atol=0.005)
+
+
+def test_on_a_plane_the_distance_is_the_offset_and_far_away_the_field():
+    rng = np.random.default_rng(0)
+    points = np.column_stack([rng.uniform(-0.4, 0.4, (3000, 2)), np.full(3000, 0.1)])
+    surface = seen_surface(points, np.tile([0.0, 0.2, 3.0], (3000, 1)), REACH)
+    height = np.array([-0.01, 0.0, 0.01, 0.3])
+    queries = np.column_stack([np.zeros((4, 2)), 0.1 + height])
+    found = surface.corrected(queries, np.full(4, 0.7))
+    along = surface.tree.query(queries)[0] ** 2 - height**2
+    say = np.exp(-((height / REACH) ** 4) - (along / surface.gap**2) ** 2)
+    np.testing.assert_allclose(found, say * height + (1 - say) * 0.7, atol=1e-9)
+    assert say[1] > 0.9 and found[3] == 0.7
+
+
+def test_the_field_says_which_side_is_inside():
+    points, queries = sphere(2000, 0.3), sphere(200, 0.31, seed=5)
+    out, inward = (seen_surface(points, s * points, REACH) for s in (1, -1))
+    far = np.zeros(200)
+    np.testing.assert_allclose(out.corrected(queries, far), -inward.corrected(queries, far), atol=1e-12)
+    assert (out.corrected(queries, far) > 0).all()
+
+
+def test_turning_everything_changes_nothing():
+    R = Rotation.random(random_state=0).as_matrix()
+    points, queries = (
+        sphere(1000, 0.3) * [1.0, 0.7, 0.4],
+        np.random.default_rng(2).uniform(-0.4, 0.4, (500, 3)),
+    )
+    slope, field = points / [1.0, 0.49, 0.16], np.linspace(-1, 1, 500)
+    here = seen_surface(points, slope, REACH).corrected(queries, field)
+    turned = seen_surface(points @ R.T, slope @ R.T, REACH).corrected(queries @ R.T, field)
+    np.testing.assert_allclose(turned, here, atol=1e-9)
+    assert (here != field).any() and (here == field).any()
+
+
+@pytest.mark.parametrize(
+    "points",
+    [np.zeros((40, 3)), np.repeat(np.eye(3), 20, axis=0), np.outer(np.linspace(0, 1, 50), [1.0, 2.0, 3.0])],
+    ids=["one point", "three points", "a line"],
+)
+def test_points_without_a_plane_give_finite_values(points):
+    surface = seen_surface(points, np.ones_like(points), REACH)
+    values = surface.corrected(np.random.default_rng(0).uniform(-1, 1, (100, 3)), np.ones(100))
+    assert np.isfinite(values).all()
+
+
+def test_at_most_so_many_points_are_kept_from_first_to_last():
+    points = np.arange(3 * 10_000.0).reshape(-1, 3)
+    kept = some_of(points)
+    assert len(kept) == MOST and (kept[[0, -1]] == points[[0, -1]]).all()
+    np.testing.assert_array_equal(some_of(points[:10]), points[:10])
