@@ -55,14 +55,14 @@ def variants(robust: RegistrationConfig) -> dict[str, RegistrationConfig]:
     """Registration by surfaces, and it without or with one thing."""
     changes = {
         "surfaces": {},
-        "descent on the field": {"refine": "descent", "keep_starts": 3},
+        "descent on the field": {"refine": "descent", "keep_starts": 3, "steps": 25, "learning_rate": 0.01},
         "no polish": {"polish_steps": 0},
-        "short reach at the end": {"last_reach": 0.03},
+        "height is free": {"lift_weight": 0.0},
+        "truncation halved": {"truncation": robust.truncation / 2},
         "3 starts kept": {"keep_starts": 3},
-        "12 starts kept": {"keep_starts": 12},
+        "12 turns to start from": {"yaw_starts": 12},
     }
-    whole = dataclasses.replace(robust, refine="surface", keep_starts=6)
-    return {name: dataclasses.replace(whole, **change) for name, change in changes.items()}
+    return {name: dataclasses.replace(robust, **change) for name, change in changes.items()}
 
 
 def table(records: list[Record], right_deg: float) -> Table:

@@ -139,7 +139,8 @@ def match_own(
     if not one or not other:
         return {}
     objects = [new_object(k, 0, i, e) for k, (i, e) in enumerate(zip(one, one_codes, strict=True))]
-    return {one[k].id: other[i].id for k, i, _ in match_scan(objects, other, other_codes, config)}
+    found = match_scan(objects, other, other_codes, config).found
+    return {one[f.object].id: other[f.instance].id for f in found}
 
 
 def record(scene: KnownScene, b: int, method: str, matched: dict[int, int], seconds: float) -> Record:

@@ -7,13 +7,17 @@ distance: what one scan did not see pulls ever less.
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
 import jaxlie
 from jax import Array
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
-from more2_jax.geometry import FAR, Sampled, nearest
+from more2_jax.geometry import FAR, Sampled, nearest_index, thin
+from more2_jax.nearest_grid import NearestGrid, look_up, nearest_grid, scale_grid
 from more2_jax.types import pytree
 
 ALONG = 0.02  # weight of sliding along the surface, against leaving it
@@ -29,24 +33,63 @@ class Surface:
     sampled: Sampled
     normals: Float[Array, "*b n 3"]  # of the sample
     dense_normals: Float[Array, "*b m 3"]
+    grid: NearestGrid | None = None  # names the nearest of `dense`; without it every distance is measured
 
 
 def surface(cloud: Sampled) -> Surface:
-    """The cloud with normals, each the direction of least spread of its neighbourhood, weighted by a Gaussian."""
-    width = NEIGHBOURHOOD * spacing(cloud.dense, cloud.dense_mask)
+    """The cloud with the normals of its sample and of all of it."""
+    normals_of = normal_estimator(cloud.dense, cloud.dense_mask)
+    return Surface(sampled=cloud, normals=normals_of(cloud.points), dense_normals=normals_of(cloud.dense))
+
+
+def whole_surface(points: Float[Array, "n 3"], mask: Bool[Array, " n"]) -> Surface:
+    """A cloud that is its own sample; `thinned` and `coarsened` make of it what is compared."""
+    normals = normal_estimator(points, mask)(points)
+    cloud = Sampled(points=points, mask=mask, dense=points, dense_mask=mask)
+    return Surface(sampled=cloud, normals=normals, dense_normals=normals)
+
+
+def thinned(s: Surface, count: int) -> Surface:
+    """With about `count` of all points for a sample, as densely as each part was seen."""
+    cloud = s.sampled
+    index, real = thin(cloud.dense_mask, count)
+    sampled = dataclasses.replace(cloud, points=cloud.dense[index], mask=real)
+    return dataclasses.replace(s, sampled=sampled, normals=s.dense_normals[index])
+
+
+def coarsened(s: Surface, count: int, dense: int, cells: int) -> Surface:
+    """With about `dense` of all points, found by a table of `cells` a side, and about `count` for a sample."""
+    index, real = thin(s.sampled.dense_mask, dense)
+    points, normals = s.sampled.dense[index], s.dense_normals[index]
+    cloud = Sampled(points=points, mask=real, dense=points, dense_mask=real)
+    fewer = Surface(sampled=cloud, normals=normals, dense_normals=normals)
+    return dataclasses.replace(thinned(fewer, count), grid=nearest_grid(points, real, cells))
+
+
+def scale_surface(s: Surface, factor: Float[Array, ""]) -> Surface:
+    """The surface in other units of length."""
+    sampled = dataclasses.replace(s.sampled, points=s.sampled.points * factor, dense=s.sampled.dense * factor)
+    grid = None if s.grid is None else scale_grid(s.grid, factor)
+    return dataclasses.replace(s, sampled=sampled, grid=grid)
+
+
+def normal_estimator(
+    cloud: Float[Array, "m 3"], mask: Bool[Array, " m"]
+) -> Callable[[Float[Array, "n 3"]], Float[Array, "n 3"]]:
+    """Normals at any points: the direction of least spread of the cloud around them, weighted by a Gaussian."""
+    width = NEIGHBOURHOOD * spacing(cloud, mask)
 
     def normals(points: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
         # All moments about the cloud's own zero, by one matrix product; the cloud is centred, so none cancels badly.
-        squared = sum((points[:, None, i] - cloud.dense[None, :, i]) ** 2 for i in range(3))
-        weight = jnp.where(cloud.dense_mask, jnp.exp(-0.5 * squared / width**2), 0.0)
+        squared = sum((points[:, None, i] - cloud[None, :, i]) ** 2 for i in range(3))
+        weight = jnp.where(mask, jnp.exp(-0.5 * squared / width**2), 0.0)
         weight = weight / jnp.maximum(weight.sum(axis=1, keepdims=True), 1e-30)
-        mean = jnp.matmul(weight, cloud.dense, precision="highest")
-        products = (cloud.dense[:, :, None] * cloud.dense[:, None, :]).reshape(-1, 9)
+        mean = jnp.matmul(weight, cloud, precision="highest")
+        products = (cloud[:, :, None] * cloud[:, None, :]).reshape(-1, 9)
         second = jnp.matmul(weight, products, precision="highest").reshape(-1, 3, 3)
-        spread = second - mean[:, :, None] * mean[:, None, :]
-        return least_axis(spread)
+        return least_axis(second - mean[:, :, None] * mean[:, None, :])
 
-    return Surface(sampled=cloud, normals=normals(cloud.points), dense_normals=normals(cloud.dense))
+    return normals
 
 
 # Batched LAPACK calls that run at the same time can wait for one another for ever on the few threads of a small CPU
@@ -109,16 +152,27 @@ def correspondences(T: jaxlie.SE3, source: Surface, target: Surface) -> Correspo
     """Every sample's nearest point on the other cloud."""
     R = T.rotation().as_matrix()
     s, t = source.sampled, target.sampled
-    points, dense = T @ s.points, T @ s.dense
-    there, d_there = nearest(points, s.mask, t.dense, t.dense_mask)
-    back, d_back = nearest(t.points, t.mask, dense, s.dense_mask)
+    points = T @ s.points
+    there = closest(target, points)
+    back = closest(source, T.inverse() @ t.points)
+    a = jnp.concatenate([points, T @ s.dense[back]])
+    b = jnp.concatenate([t.dense[there], t.points])
+    real = jnp.concatenate([s.mask & t.dense_mask[there], t.mask & s.dense_mask[back]])
     return Correspondences(
-        source=jnp.concatenate([points, dense[back]]),
-        target=jnp.concatenate([t.dense[there], t.points]),
+        source=a,
+        target=b,
         source_normal=jnp.concatenate([source.normals, source.dense_normals[back]]) @ R.T,
         target_normal=jnp.concatenate([target.dense_normals[there], target.normals]),
-        squared=jnp.concatenate([d_there, d_back]),
+        squared=jnp.where(real, jnp.sum((a - b) ** 2, axis=-1), FAR),
     )
+
+
+def closest(s: Surface, points: Float[Array, "n 3"]) -> Int[Array, " n"]:
+    """Row of the cloud in full that is nearest to every point, by the table where there is one."""
+    points = jax.lax.stop_gradient(points)
+    if s.grid is not None:
+        return look_up(s.grid, points)
+    return nearest_index(points, jax.lax.stop_gradient(s.sampled.dense), s.sampled.dense_mask)
 
 
 @pytree

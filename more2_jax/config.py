@@ -64,11 +64,10 @@ class MatchingConfig:
     assignment: Literal["hungarian", "greedy"] = "hungarian"
     size_weight: float = 0.0  # how much of a mismatch in metric size is held against a pair
     max_size_ratio: float = 0.0  # 0: any
-    misfit_weight: float = (
-        0.0  # of the residual after coarse registration of the pair, in shares of the radius
-    )
     motion_weight: float = 0.0  # a metre moved costs this much score: decides among identical objects
-    reject_residual: float = 0.0  # share of the object's radius; a pair above it is not one object. 0: never
+    # Beyond the paper: surfaces decide, pairs less likely one object than two are none, the score is in log odds.
+    verify: bool = False
+    candidates: int = 8  # partners of every object, and of every instance, that are tried
 
 
 @dataclass(frozen=True)
@@ -92,10 +91,14 @@ class RegistrationConfig:
     trim: float = 1.0  # share of nearest distances that counts
     converged_rms: float = 0.05  # share of the target's radius
     refine: Literal["descent", "surface"] = "descent"  # Adam on the loss and ICP, or point-to-plane both ways
+    coarse_dense: int = 1024  # of a cloud, what the `coarse_points` of another are compared with, by a table
+    cells: int = 24  # a side, of the table of nearest points
     surface_points: int = 256  # of each cloud, compared with all of the other
     surface_steps: int = 15
-    first_reach: float = 0.15  # of a correspondence, shares of the target's radius: at first,
-    last_reach: float = 0.05  # and in the end
+    search_reach: float = 0.3  # of a correspondence, shares of the target's radius: of every start at first,
+    first_reach: float = 0.1  # of the starts that are kept,
+    last_reach: float = 0.03  # and in the end
+    lift_weight: float = 0.0  # of a pose that changes an upright object's height, where scans share a frame
     polish_points: int = 512  # then, for the best pose alone
     polish_steps: int = 10
     polish_reach: float = 0.02
@@ -207,14 +210,7 @@ def preset(name: str, *, upright: bool = False) -> SceneConfig:
             preset="robust",
             upright=upright,
             accumulate_target=True,
-            matching=MatchingConfig(
-                score="inv",
-                size_weight=0.5,
-                max_size_ratio=1.8,
-                misfit_weight=5.0,
-                motion_weight=0.01,
-                reject_residual=0.05,
-            ),
+            matching=MatchingConfig(score="inv", size_weight=0.5, motion_weight=0.2, verify=True),
             registration=RegistrationConfig(
                 points=256,
                 sdf_points=128,
@@ -222,11 +218,11 @@ def preset(name: str, *, upright: bool = False) -> SceneConfig:
                 starts="many",
                 identity_start=True,
                 yaw_starts=24 if upright else 0,
-                keep_starts=3,
-                steps=25,
-                learning_rate=0.01,
-                icp_steps=12,
+                keep_starts=6,
                 trim=0.7,
+                refine="surface",
+                lift_weight=0.1,
+                truncation=0.2,
             ),
             meshing=MeshingConfig(coarse=16, resolution=64, level="observed", seen_reach=0.02),
             joint=JointConfig(points=128, start="accumulated", steps=40, eqv_learning_rate=1e-3),

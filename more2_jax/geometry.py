@@ -72,6 +72,14 @@ def evenly(cloud: Sampled, every: int) -> Sampled:
     return dataclasses.replace(cloud, points=cloud.dense[::every], mask=cloud.dense_mask[::every])
 
 
+def thin(mask: Bool[Array, " n"], count: int) -> tuple[Int[Array, " count"], Bool[Array, " count"]]:
+    """`count` of the real rows, evenly by their order, and which of them are real: all rows where there are fewer."""
+    order = jnp.argsort(~mask, stable=True)  # the real ones first
+    real, at = mask.sum(), jnp.arange(count)
+    at = jnp.where(real > count, at * real // count, jnp.minimum(at, len(mask) - 1))
+    return order[at], jnp.arange(count) < real
+
+
 def nearest(
     a: Float[Array, "n 3"], a_mask: Bool[Array, " n"], b: Float[Array, "m 3"], b_mask: Bool[Array, " m"]
 ) -> tuple[Int[Array, " n"], Float[Array, " n"]]:
@@ -79,14 +87,15 @@ def nearest(
 
     The distance has a gradient, the index none. Distances equal to within 2⁻¹¹ count as a tie.
     """
-    index = _nearest_index(*jax.lax.stop_gradient((a, b)), b_mask)
+    index = nearest_index(*jax.lax.stop_gradient((a, b)), b_mask)
     squared = jnp.sum((a - b[index]) ** 2, axis=-1)
     return index, jnp.where(a_mask & b_mask[index], squared, FAR)
 
 
-def _nearest_index(
+def nearest_index(
     a: Float[Array, "n 3"], b: Float[Array, "m 3"], b_mask: Bool[Array, " m"]
 ) -> Int[Array, " n"]:
+    """Index of the nearest real row of `b` for every row of `a`; ties as in `nearest`."""
     offset = [(a[:, None, i] - b[None, :, i]).astype(jnp.float32) for i in range(3)]
     squared = offset[0] ** 2 + offset[1] ** 2 + offset[2] ** 2
     # The bits of floats ≥ 0 are ordered as the floats are. With the column number in the lowest bits one plain
@@ -180,15 +189,6 @@ def dominant_eigenvector(matrix: Float[Array, "4 4"]) -> Float[Array, "4"]:
     # Every column is the eigenvector times one of its components; the longest is the safest.
     column = power[:, jnp.argmax(jnp.diagonal(power))]
     return column / jnp.sqrt(jnp.sum(column * column) + TINY)
-
-
-def principal_axes(points: Float[Array, "n 3"], mask: Bool[Array, " n"]) -> Float[Array, "3 3"]:
-    """Right-handed principal axes of a cloud as columns, longest first."""
-    weight = mask / jnp.maximum(mask.sum(), 1)
-    centred = points - weight @ points
-    _, axes = jnp.linalg.eigh(jnp.matmul((weight[:, None] * centred).T, centred, precision="highest"))
-    axes = axes[:, ::-1]
-    return axes.at[:, 2].multiply(jnp.linalg.det(axes))
 
 
 def cloud_radius(points: Float[Array, "n 3"], mask: Bool[Array, " n"]) -> Float[Array, ""]:

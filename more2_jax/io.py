@@ -205,6 +205,7 @@ def scene_to_json(scene: LivingScene) -> dict[str, Any]:
                 "static": list(c.static),
                 "added": list(c.added),
                 "removed": list(c.removed),
+                "probability": {k: float(p) for k, p in c.probability.items()},
             }
             for c in scene.changes
         ],
@@ -225,6 +226,9 @@ def _object_to_json(o: SceneObject) -> dict[str, Any]:
                 "score": float(seen.score),
                 "rms_m": float(seen.rms_m),
                 "converged": bool(seen.converged),
+                "interchangeable": bool(seen.interchangeable),
+                "sigma_m": float(seen.sigma_m),
+                "sigma_deg": float(seen.sigma_deg),
             }
             for seen in o.observations
         ],
@@ -274,7 +278,12 @@ def _scene(folder: Path, content: dict[str, Any]) -> LivingScene:
         scans=tuple(ScanRecord(**s) for s in scans),
         objects=tuple(_object(folder, o, embeddings[o["id"]]) for o in content["objects"]),
         changes=tuple(
-            Changes(from_scan=c["from"], to_scan=c["to"], **{k: tuple(c[k]) for k in kinds})
+            Changes(
+                from_scan=c["from"],
+                to_scan=c["to"],
+                **{k: tuple(c[k]) for k in kinds},
+                probability=c.get("probability", {}),
+            )
             for c in content["changes"]
         ),
         timing_s=content["timing_s"],

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from jaxtyping import Float
+from scipy.special import ndtr
 
 from more2_jax.config import SceneConfig
 from more2_jax.metrics import apply_pose, rotation_error_deg
@@ -14,6 +15,10 @@ from more2_jax.types import Changes, Embedding, Instance, Observation, SceneObje
 
 Pose = Float[np.ndarray, "4 4"]
 Points = Float[np.ndarray, "n 3"]
+
+# Registration takes correspondences as independent: true errors are larger than it says, by about this much.
+OPTIMISM = 3.0
+SURE = 2.0  # standard errors that a motion must exceed
 
 
 def new_object(number: int, scan: int, instance: Instance, embedding: Embedding) -> SceneObject:
@@ -66,15 +71,45 @@ def motion_between(o: SceneObject, before: Observation, after: Observation) -> t
     return distance, float(rotation_error_deg(T_after_before[:3, :3], np.eye(3)))
 
 
-def changes_between(objects: Sequence[SceneObject], a: int, b: int, config: SceneConfig) -> Changes:
-    """What moved, stayed, came (also: came back) and went between two scans."""
+def changes_between(
+    objects: Sequence[SceneObject],
+    a: int,
+    b: int,
+    config: SceneConfig,
+    chance: Mapping[str, float] | None = None,
+) -> Changes:
+    """What moved, stayed, came (also: came back) and went between two scans.
+
+    `chance`: probabilities, by object, that what came or went did. Those of motion are worked out here.
+    """
     found: dict[str, list[str]] = {"moved": [], "static": [], "added": [], "removed": []}
+    probability: dict[str, float] = {}
     for o in objects:
         before, after = observation_in(o, a), observation_in(o, b)
         if before and after:
-            distance, angle_deg = motion_between(o, before, after)
-            still = distance <= config.static_m and angle_deg <= config.static_deg
-            found["static" if still else "moved"].append(o.id)
+            moved = moved_probability(o, before, after, config)
+            found["moved" if moved > 0.5 else "static"].append(o.id)
+            probability[o.id] = max(moved, 1 - moved)
         elif before or after:
             found["removed" if before else "added"].append(o.id)
-    return Changes(from_scan=a, to_scan=b, **{k: tuple(v) for k, v in found.items()})
+            if chance and o.id in chance:
+                probability[o.id] = chance[o.id]
+    lists = {k: tuple(v) for k, v in found.items()}
+    return Changes(from_scan=a, to_scan=b, **lists, probability=probability)
+
+
+def moved_probability(o: SceneObject, before: Observation, after: Observation, config: SceneConfig) -> float:
+    """That an object moved: by more than `static_m` or `static_deg`, and than registration's own error explains.
+
+    Measured motions are taken as normal about the true ones. Without an error (`paper`), 0 or 1.
+    """
+    distance, angle_deg = motion_between(o, before, after)
+    found = []
+    for motion, limit, own in (
+        (distance, config.static_m, "sigma_m"),
+        (angle_deg, config.static_deg, "sigma_deg"),
+    ):
+        error = OPTIMISM * float(np.hypot(getattr(before, own), getattr(after, own)))
+        limit = max(limit, SURE * error)
+        found.append(float(ndtr((motion - limit) / error)) if error > 0 else float(motion > limit))
+    return max(found)

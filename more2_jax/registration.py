@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import jaxlie
 import numpy as np
 from jax import Array
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
 from more2_jax.config import RegistrationConfig
@@ -32,11 +32,10 @@ from more2_jax.geometry import (
 )
 from more2_jax.prior import Prior, field_sdf, object_field
 from more2_jax.starts import Pair, candidate_poses
-from more2_jax.surface_registration import register_surfaces
+from more2_jax.surface_registration import lowest_apart, register_surfaces
 from more2_jax.types import Embedding, PointCloud, Registration, scale_embedding
 
 STILL = 1e-2  # a last ICP step below this (radians, and shares of the radius) has settled
-APART_DEG = 25.0  # refined poses differ by at least this
 # How much worse "it did not move" may fit and still be chosen (the offset in shares of the radius).
 STAYED_RATIO, STAYED_OFFSET = 1.1, 0.001
 
@@ -103,9 +102,10 @@ def register_one(prior: Prior, pair: Pair, config: RegistrationConfig, upright: 
     """
     radius = cloud_radius(pair.target.points, pair.target.mask)
     pair = rescale(pair, 1 / radius)
-    starts = keep_best(candidate_poses(pair, config, upright), pair, config)
+    starts = candidate_poses(pair, config, upright)
     if config.refine == "surface":
         return in_metres(register_surfaces(starts, pair, config, upright), radius)
+    starts = keep_best(starts, pair, config)
     refined = jax.vmap(lambda T: refine(prior, T, pair, config))(starts)
     if config.identity_start:
         refined = with_stayed(prior, refined, pair, config)
@@ -155,62 +155,6 @@ def keep_best(starts: jaxlie.SE3, pair: Pair, config: RegistrationConfig) -> jax
     misfit = jax.vmap(lambda T: residual(T, source, target, config.trim))(moved)
     best = lowest_apart(misfit, moved.rotation(), config.keep_starts)
     return jax.tree.map(lambda x: x[best], moved)
-
-
-def lowest_apart(cost: Float[Array, " n"], rotation: jaxlie.SO3, count: int) -> Int[Array, " count"]:
-    """Indices of the `count` lowest costs whose rotations are at least `APART_DEG` from one another.
-
-    Many starts end in the same place; without this the few kept would be copies of one pose.
-    """
-
-    def body(cost: Array, _: None) -> tuple[Array, Array]:
-        best = jnp.argmin(cost)
-        # ⟨q, q'⟩ = cos of half the angle between two rotations, either sign.
-        half = jnp.abs(rotation.wxyz @ rotation.wxyz[best])
-        return jnp.where(half > jnp.cos(jnp.deg2rad(APART_DEG) / 2), jnp.inf, cost), best
-
-    return jax.lax.scan(body, cost, length=count)[1]
-
-
-@partial(jax.jit, static_argnames=("config", "upright"))
-def pairwise_misfit(
-    source: PointCloud,
-    target: PointCloud,
-    source_code: Embedding,
-    target_code: Embedding,
-    config: RegistrationConfig,
-    upright: bool,
-) -> Float[Array, "n m"]:
-    """How badly every source (m) fits every target (n) at the best of few, coarsely refined poses.
-
-    Residuals in shares of the target's radius: geometry's word on who is who, beside the embedding's.
-    """
-    coarse = dataclasses.replace(
-        config,
-        points=48,
-        coarse_points=48,
-        keep_starts=1,
-        coarse_steps=6,
-        yaw_starts=min(config.yaw_starts, 12),
-    )
-
-    def sampled(cloud: PointCloud) -> Sampled:
-        return jax.vmap(lambda p, m: sample(p, m, coarse.points, dense=True))(cloud.points, cloud.mask)
-
-    sources, targets = sampled(source), sampled(target)
-
-    def misfit(s: Sampled, s_code: Embedding, t: Sampled, t_code: Embedding) -> Float[Array, ""]:
-        radius = cloud_radius(t.points, t.mask)
-        pair = Pair(source=s, target=t, source_code=s_code, target_code=t_code, offset=jnp.zeros(3))
-        pair = rescale(pair, 1 / radius)
-        start = jax.tree.map(lambda x: x[0], keep_best(candidate_poses(pair, coarse, upright), pair, coarse))
-        T = icp(start, pair.source, pair.target, coarse.trim, coarse.coarse_steps)
-        return residual(T, pair.source, pair.target, coarse.trim)
-
-    def row(one: tuple[Sampled, Embedding]) -> Float[Array, " m"]:
-        return jax.vmap(lambda s, c: misfit(s, c, *one))(sources, source_code)
-
-    return jax.lax.map(row, (targets, target_code))
 
 
 def residual(T: jaxlie.SE3, source: Sampled, target: Sampled, share: float) -> Float[Array, ""]:

@@ -57,22 +57,26 @@ def add_scan(
     with stage("encode", len(instances)):
         embeddings = embed(prior, [i.points for i in instances])
     with stage("match", len(instances)):
-        pairs = match_scan(objects, instances, embeddings, config)
-    with stage("register", len(pairs), unit="pairs"):
-        found = register_scan(prior, objects, instances, embeddings, pairs, index, config)
-    for k, i, observation in found:
-        objects[k] = seen_again(objects[k], instances[i], observation)
+        identified = match_scan(objects, instances, embeddings, config)
+    found, chance = identified.found, {objects[k].id: p for k, p in identified.gone.items()}
+    with stage("register", len(found), unit="pairs"):
+        seen = register_scan(prior, objects, instances, embeddings, found, index, config)
+    for f, observation in zip(found, seen, strict=True):
+        objects[f.object] = seen_again(objects[f.object], instances[f.instance], observation)
+        if config.matching.verify:
+            chance[objects[f.object].id] = f.score  # that what came back is what it was
     if config.accumulate_target:
         with stage("encode", len(found)):
-            objects = embed_accumulated(prior, objects, [k for k, _, _ in found])
-    known = {i for _, i, _ in found}
+            objects = embed_accumulated(prior, objects, [f.object for f in found])
+    known = {f.instance for f in found}
     for i in (i for i in range(len(instances)) if i not in known):
         objects.append(new_object(len(objects), index, instances[i], embeddings[i]))
+        chance |= {objects[-1].id: identified.new[i]} if i in identified.new else {}
     return dataclasses.replace(
         scene,
         scans=(*scene.scans, record(index, scan, instances, skipped)),
         objects=tuple(objects),
-        changes=(*scene.changes, changes_between(objects, index - 1, index, config)),
+        changes=(*scene.changes, changes_between(objects, index - 1, index, config, chance)),
         timing_s=timing,
     )
 
@@ -93,7 +97,9 @@ def reconstruct(
         for done, k in enumerate(todo, start=1):
             objects[k] = dataclasses.replace(objects[k], mesh=mesh_of(prior, objects[k], config))
             advance(done)
-    changes = tuple(changes_between(objects, c.from_scan, c.to_scan, config) for c in scene.changes)
+    changes = tuple(
+        changes_between(objects, c.from_scan, c.to_scan, config, c.probability) for c in scene.changes
+    )
     return dataclasses.replace(scene, objects=tuple(objects), changes=changes, timing_s=timing)
 
 

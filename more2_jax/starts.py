@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import itertools
-
 import jax
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
 from jax import Array
 from jaxtyping import Float
+from scipy.spatial.transform import Rotation
 
 from more2_jax.config import RegistrationConfig
-from more2_jax.geometry import Sampled, kabsch, kabsch_rotation, principal_axes
+from more2_jax.geometry import Sampled, kabsch, kabsch_rotation
 from more2_jax.types import Embedding, pytree
 
 
@@ -34,31 +33,27 @@ def embedding_pose(source: Embedding, target: Embedding) -> jaxlie.SE3:
 
 
 def candidate_poses(pair: Pair, config: RegistrationConfig, upright: bool) -> jaxlie.SE3:
-    """All starts of a pair, batched."""
+    """All starts of a pair, batched: every rotation about the codes' centres and about the clouds' means.
+
+    Upright, in scans of one frame, those about the means keep their height: what stands on the floor stays there."""
     if config.starts == "embedding":
         return jax.tree.map(lambda x: x[None], embedding_pose(pair.source_code, pair.target_code))
     rotations = candidate_rotations(pair, config, upright)
     from_codes = place(rotations, pair.source_code.center, pair.target_code.center)
     from_means = place(rotations, _mean(pair.source), _mean(pair.target))
+    if upright and config.identity_start:
+        level = from_means.translation().at[:, 2].set(pair.offset[2])
+        from_means = jaxlie.SE3.from_rotation_and_translation(rotations, level)
     return jax.tree.map(lambda *x: jnp.concatenate(x), from_codes, from_means)
 
 
 def candidate_rotations(pair: Pair, config: RegistrationConfig, upright: bool) -> jaxlie.SO3:
-    """The embedding's rotation, its flips about the target's principal axes, principal axes on principal axes,
-    and turns about the vertical (`upright`) or the 24 rotations of a cube after the embedding's.
+    """The embedding's rotation, and turns about the vertical (`upright`) or the 60 rotations of an icosahedron.
 
-    `upright`: of each, the nearest turn about the vertical."""
+    `upright`: of the embedding's, the nearest turn about the vertical."""
     by_code = kabsch_rotation(pair.source_code.eqv.T, pair.target_code.eqv.T).as_matrix()
-    source_axes = principal_axes(pair.source.points, pair.source.mask)
-    target_axes = principal_axes(pair.target.points, pair.target.mask)
-    flips = jnp.asarray(HALF_TURNS)
-    flipped = target_axes @ flips @ target_axes.T @ by_code  # the first half turn is none at all
-    aligned = target_axes @ flips @ source_axes.T
-    if upright and config.yaw_starts:
-        others = jnp.asarray(yaw_turns(config.yaw_starts))
-    else:
-        others = jnp.asarray(cube_rotations()) @ by_code
-    matrices = jnp.concatenate([flipped, aligned, others.astype(by_code.dtype)])
+    others = yaw_turns(config.yaw_starts) if upright and config.yaw_starts else icosahedral_rotations()
+    matrices = jnp.concatenate([by_code[None], jnp.asarray(others, by_code.dtype)])
     rotations = jax.vmap(jaxlie.SO3.from_matrix)
     return rotations(matrices) if not upright else jax.vmap(jaxlie.SO3.from_z_radians)(yaw_of(matrices))
 
@@ -83,11 +78,6 @@ def _mean(cloud: Sampled) -> Float[Array, "3"]:
     return (cloud.mask / jnp.maximum(cloud.mask.sum(), 1)) @ cloud.points
 
 
-HALF_TURNS = np.stack([np.diag(d) for d in ((1.0, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1))]).astype(
-    np.float32
-)
-
-
 def yaw_turns(count: int) -> Float[np.ndarray, "count 3 3"]:
     """`count` turns about z, evenly spaced, the first none at all."""
     angle = 2 * np.pi * np.arange(count) / count
@@ -96,12 +86,6 @@ def yaw_turns(count: int) -> Float[np.ndarray, "count 3 3"]:
     return np.moveaxis(np.array(rows), -1, 0).astype(np.float32)
 
 
-def cube_rotations() -> Float[np.ndarray, "24 3 3"]:
-    """The rotations that map a cube onto itself."""
-    turns = []
-    for order in itertools.permutations(range(3)):
-        for signs in itertools.product((1.0, -1.0), repeat=3):
-            matrix = np.diag(signs)[:, order]
-            if np.linalg.det(matrix) > 0:
-                turns.append(matrix)
-    return np.stack(turns).astype(np.float32)
+def icosahedral_rotations() -> Float[np.ndarray, "60 3 3"]:
+    """The rotations that map an icosahedron onto itself: no rotation is farther than 45° from one of them."""
+    return Rotation.create_group("I").as_matrix().astype(np.float32)

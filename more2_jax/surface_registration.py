@@ -7,23 +7,37 @@ the unseen spoils.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import jax
 import jax.numpy as jnp
 import jaxlie
 from jax import Array
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
-from more2_jax.alignment import Surface, align, align_step, correspondences, pose_covariance, surface
+from more2_jax.alignment import (
+    Surface,
+    align,
+    align_step,
+    coarsened,
+    correspondences,
+    pose_covariance,
+    thinned,
+    whole_surface,
+)
 from more2_jax.config import RegistrationConfig
-from more2_jax.geometry import FAR, Sampled, evenly, move, two_way_rms
+from more2_jax.geometry import FAR, move, two_way_rms
 from more2_jax.starts import Pair
 from more2_jax.types import Registration
 
 STILL = 1e-2  # a last step below this (radians, and shares of the radius) has settled
 # How much worse "it did not move" may fit and still be chosen; so much worse, another pose still competes.
 STAYED_RATIO, STAYED_OFFSET = 1.1, 0.01
+FINE = 0.25  # share of the truncation: the nearer one by which refined poses are told apart
 POINT_SHARE = 0.4  # of the distance to the nearest point, in a misfit; the rest is that off its surface
 TURNED_DEG = 15.0  # competing poses differ by more
+APART_DEG = 25.0  # poses kept for refinement differ by at least this
+LIFTED = 0.1  # shares of the radius: an object lifted by this costs all of `lift_weight`
 
 
 def register_surfaces(
@@ -33,18 +47,23 @@ def register_surfaces(
 
     `pair` is in units of the target's radius, and so is the result. `loss` and `misfit` are the truncated distance.
     """
-    source, target = (surface(thinned(c, config.surface_points)) for c in (pair.source, pair.target))
+    whole = [whole_surface(c.dense, c.dense_mask) for c in (pair.source, pair.target)]
+    coarse = [coarse_of(s, config) for s in whole]
+    starts, _ = search(starts, coarse[0], coarse[1], pair.offset, config, upright)
+    source, target = (thinned(s, config.surface_points) for s in whole)
     stayed = jaxlie.SE3.from_rotation_and_translation(jaxlie.SO3.identity(), pair.offset)
     stayed = jax.tree.map(lambda x: x[None], stayed)
     if config.identity_start:
         starts = join(starts, stayed)
     reach = (config.first_reach, config.last_reach)
+    truncations = (FINE * config.truncation, config.truncation)
     poses = jax.vmap(lambda T: align(T, source, target, reach, config.surface_steps, upright))(starts)
     if config.identity_start:
         poses = join(poses, stayed)  # also exactly as it is
-    misfits = jax.vmap(lambda T: misfit(T, source, target, config.truncation))(poses)
-    best = choose(misfits, config.identity_start)
-    T = polished(jax.tree.map(lambda x: x[best], poses), pair, misfits[best], config, upright)
+    misfits = jax.vmap(lambda T: misfit(T, source, target, truncations))(poses)
+    costs = misfits + lifted(poses, pair.offset, config, upright)
+    best = choose(costs, config.identity_start)
+    T = polished(jax.tree.map(lambda x: x[best], poses), whole, misfits[best], config, upright)
     if config.identity_start:  # what stayed is exactly where it was
         T = jax.tree.map(lambda x, y: jnp.where(best == len(misfits) - 1, y[0], x), T, stayed)
     rms = two_way_rms(move(T, source.sampled), target.sampled, config.trim)
@@ -59,19 +78,69 @@ def register_surfaces(
         misfit=misfits[best],
         covariance=pose_covariance(T, source, target, config.last_reach, upright),
         competing=poses,
-        competes=competing(poses, misfits, best),
+        competes=competing(poses, costs, best),
     )
 
 
+def coarse_of(s: Surface, config: RegistrationConfig) -> Surface:
+    """The surface as `search` takes it."""
+    return coarsened(s, config.coarse_points, config.coarse_dense, config.cells)
+
+
+def search(
+    starts: jaxlie.SE3,
+    source: Surface,
+    target: Surface,
+    offset: Float[Array, "3"],
+    config: RegistrationConfig,
+    upright: bool,
+) -> tuple[jaxlie.SE3, Float[Array, " k"]]:
+    """Aligns every start by coarse surfaces; the best `keep_starts` that lie apart, and their costs."""
+    reach = (config.search_reach, config.first_reach)
+    moved = jax.vmap(lambda T: align(T, source, target, reach, config.coarse_steps, upright))(starts)
+    cost = jax.vmap(lambda T: misfit(T, source, target, (config.truncation,)))(moved)
+    cost = cost + lifted(moved, offset, config, upright)
+    best = lowest_apart(cost, moved.rotation(), min(config.keep_starts, len(cost)))
+    return jax.tree.map(lambda x: x[best], moved), cost[best]
+
+
+def lifted(
+    poses: jaxlie.SE3, offset: Float[Array, "3"], config: RegistrationConfig, upright: bool
+) -> Float[Array, " k"]:
+    """What it costs to be at another height than before: upright objects of scans in one frame stand on the floor."""
+    height = jnp.abs(poses.translation()[:, 2] - offset[2])
+    weight = config.lift_weight if upright and config.identity_start else 0.0
+    return weight * jnp.minimum(height / LIFTED, 1.0)
+
+
+def lowest_apart(cost: Float[Array, " n"], rotation: jaxlie.SO3, count: int) -> Int[Array, " count"]:
+    """Indices of the `count` lowest costs whose rotations are at least `APART_DEG` from one another.
+
+    Many starts end in the same place; without this the few kept would be copies of one pose.
+    """
+
+    def body(cost: Array, _: None) -> tuple[Array, Array]:
+        best = jnp.argmin(cost)
+        # ⟨q, q'⟩ = cos of half the angle between two rotations, either sign.
+        half = jnp.abs(rotation.wxyz @ rotation.wxyz[best])
+        return jnp.where(half > jnp.cos(jnp.deg2rad(APART_DEG) / 2), jnp.inf, cost), best
+
+    return jax.lax.scan(body, cost, length=count)[1]
+
+
 def polished(
-    T: jaxlie.SE3, pair: Pair, before: Float[Array, ""], config: RegistrationConfig, upright: bool
+    T: jaxlie.SE3,
+    whole: Sequence[Surface],
+    before: Float[Array, ""],
+    config: RegistrationConfig,
+    upright: bool,
 ) -> jaxlie.SE3:
     """The pose aligned with more points and a short reach; as it was if that makes it fit worse."""
-    source, target = (surface(thinned(c, config.polish_points)) for c in (pair.source, pair.target))
+    source, target = (thinned(s, config.polish_points) for s in whole)
     reach = (config.last_reach, config.polish_reach)
     finer = align(T, source, target, reach, config.polish_steps, upright)
-    better = misfit(finer, source, target, config.truncation) <= before * STAYED_RATIO + STAYED_OFFSET
-    return jax.tree.map(lambda x, y: jnp.where(better, x, y), finer, T)
+    fit = misfit(finer, source, target, (FINE * config.truncation, config.truncation))
+    return jax.tree.map(lambda x, y: jnp.where(fit <= before * STAYED_RATIO + STAYED_OFFSET, x, y), finer, T)
 
 
 def join(a: jaxlie.SE3, b: jaxlie.SE3) -> jaxlie.SE3:
@@ -79,27 +148,38 @@ def join(a: jaxlie.SE3, b: jaxlie.SE3) -> jaxlie.SE3:
     return jax.tree.map(lambda x, y: jnp.concatenate([x, y]), a, b)
 
 
-def thinned(cloud: Sampled, count: int) -> Sampled:
-    """About `count` of the cloud's rows, sampled as densely as it was seen."""
-    return evenly(cloud, max(1, len(cloud.dense) // count))
+def misfit(
+    T: jaxlie.SE3, source: Surface, target: Surface, truncations: tuple[float, ...]
+) -> Float[Array, ""]:
+    """Mean truncated distance both ways, as a share of the truncation; 1 if the pose is not finite."""
+    there, back = misfits_both_ways(T, source, target, truncations)
+    return (there + back) / 2
 
 
-def misfit(T: jaxlie.SE3, source: Surface, target: Surface, truncation: float) -> Float[Array, ""]:
-    """Mean truncated distance both ways, as a share of the truncation; 1 if the pose is not finite.
+def misfits_both_ways(
+    T: jaxlie.SE3, source: Surface, target: Surface, truncations: tuple[float, ...]
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Mean truncated distance of the source's points and of the target's, as shares of the truncation.
 
-    Of a point near the other cloud it is mostly the distance off its surface: that to the nearest point has the
-    spacing of points for a floor, under which details such as a handle disappear.
+    Of several truncations the mean: a far one sees the whole object, a near one a handle. Of a point near the other
+    cloud it is mostly the distance off its surface: that to the nearest point has the spacing of points for a floor,
+    under which details disappear. 1 if the pose is not finite.
     """
     c = correspondences(T, source, target)
     gap, count = c.target - c.source, len(source.normals)
     off = sum(jnp.sum(gap * normal, axis=-1) ** 2 for normal in (c.source_normal, c.target_normal)) / 2
     near = (1 - POINT_SHARE) * off + POINT_SHARE * c.squared
-    squared = jnp.where(c.squared < truncation**2, near, c.squared)
-    share = jnp.minimum(jnp.sqrt(squared + 1e-12) / truncation, 1.0)
-    real = c.squared < FAR
-    ways = [(share[:count], real[:count]), (share[count:], real[count:])]
-    mean = sum(jnp.where(r, s, 0.0).sum() / jnp.maximum(r.sum(), 1) for s, r in ways) / 2
-    return jnp.where(jnp.isfinite(mean) & jnp.isfinite(T.wxyz_xyz).all(), mean, 1.0)
+    real, finite = c.squared < FAR, jnp.isfinite(T.wxyz_xyz).all()
+    shares = jnp.zeros_like(near)
+    for limit in truncations:
+        squared = jnp.where(c.squared < limit**2, near, c.squared)
+        shares += jnp.minimum(jnp.sqrt(squared + 1e-12) / limit, 1.0) / len(truncations)
+
+    def mean(share: Array, real: Array) -> Array:
+        value = jnp.where(real, share, 0.0).sum() / jnp.maximum(real.sum(), 1)
+        return jnp.where(finite & jnp.isfinite(value), value, 1.0)
+
+    return mean(shares[:count], real[:count]), mean(shares[count:], real[count:])
 
 
 def choose(misfits: Float[Array, " k"], stayed_is_last: bool) -> Array:

@@ -155,9 +155,12 @@ class Observation:
     scan: int
     instance: int
     T_ref_scan: Float[np.ndarray, "4 4"]  # float64, row-major
-    score: float  # of the match; 1 for the reference observation itself
+    score: float  # of the match (`robust`: its probability); 1 for the reference observation itself
     rms_m: float
     converged: bool
+    interchangeable: bool = False  # another assignment explains the scans as well: one of identical copies
+    sigma_m: float = 0.0  # standard error of the position of its points' mean, and
+    sigma_deg: float = 0.0  # of its rotation, as registration has it; 0 where it has none
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -188,6 +191,7 @@ class Changes:
     static: tuple[str, ...] = ()
     added: tuple[str, ...] = ()
     removed: tuple[str, ...] = ()
+    probability: dict[str, float] = field(default_factory=dict)  # of what is said of an object, where known
 
 
 @dataclass(frozen=True, kw_only=True)

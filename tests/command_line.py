@@ -17,7 +17,6 @@ registration:
   {points: 64, coarse_points: 32, coarse_steps: 2, keep_starts: 1, yaw_starts: 0, steps: 2, icp_steps: 2}
 joint: {points: 64, steps: 2}
 meshing: {coarse: 8, resolution: 16}
-matching: {reject_residual: 0.0}
 """
 
 

@@ -112,10 +112,10 @@ def test_covariance_is_the_spread_over_repeated_noise_up_to_a_small_factor():
 def test_misfit_is_0_of_a_cloud_with_itself_and_1_far_away():
     s = as_surface(box_points(np.random.default_rng(5))[0])
     far = jaxlie.SE3.from_translation(jnp.array([10.0, 0, 0]))
-    assert float(misfit(jaxlie.SE3.identity(), s, s, 0.1)) < 1e-4
-    assert float(misfit(far, s, s, 0.1)) == pytest.approx(1)
+    assert float(misfit(jaxlie.SE3.identity(), s, s, (0.1,))) < 1e-4
+    assert float(misfit(far, s, s, (0.1,))) == pytest.approx(1)
     lost = jaxlie.SE3(jnp.full(7, jnp.nan))
-    assert float(misfit(lost, s, s, 0.1)) == 1
+    assert float(misfit(lost, s, s, (0.1,))) == 1
 
 
 def test_it_stayed_wins_when_as_good_and_loses_when_worse():

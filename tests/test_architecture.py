@@ -15,7 +15,7 @@ LONGEST_FILE, LONGEST_FUNCTION = 400, 40  # lines
 # Low to high; a module imports from its own layer or those before it. `data.*` and `commands.*` are folders.
 LAYERS = {
     "types": ("types", "config", "progress"),
-    "tools": ("geometry", "batching", "descent", "metrics", "meshfile", "data"),
+    "tools": ("geometry", "nearest_grid", "batching", "descent", "metrics", "meshfile", "data"),
     "network": (
         "vn",
         "neighbours",
@@ -32,12 +32,13 @@ LAYERS = {
         "starts",
         "matching",
         "surface_registration",
+        "evidence",
         "registration",
         "seen_surface",
         "meshing",
         "joint",
     ),
-    "scene": ("objects", "encoding", "tracking", "fitting", "scene"),
+    "scene": ("objects", "encoding", "verification", "tracking", "fitting", "scene"),
     "programs": ("io", "report", "export", "demo", "commands", "cli", "train", "eval"),
 }
 HEIGHT = {name: height for height, names in enumerate(LAYERS.values()) for name in names}

@@ -44,7 +44,7 @@ def test_paper_is_the_paper():
     assert paper.registration.starts == "embedding"
     assert (paper.registration.steps, paper.registration.trim) == (200, 1.0)
     assert (paper.joint.start, paper.joint.steps) == ("best", 200)
-    assert paper.matching.misfit_weight == paper.matching.reject_residual == 0
+    assert paper.matching.motion_weight == 0 and not paper.matching.verify
     assert not paper.accumulate_target
 
 

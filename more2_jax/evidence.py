@@ -1,0 +1,134 @@
+"""Who is who by geometry: every candidate pair of objects aligned from many starts, and how well it then fits.
+
+Beyond the paper (preset `robust`): the embedding proposes, surfaces decide. A pair costs some milliseconds, since
+clouds are prepared once and compared by tables of nearest points.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jaxtyping import Float, Int
+
+from more2_jax.alignment import Surface, scale_surface, whole_surface
+from more2_jax.config import RegistrationConfig
+from more2_jax.geometry import cloud_radius
+from more2_jax.starts import Pair, candidate_poses
+from more2_jax.surface_registration import LIFTED, coarse_of, misfits_both_ways, search
+from more2_jax.types import Embedding, PointCloud, pytree, scale_embedding
+
+AT_ONCE = 8  # pairs aligned side by side: as many as a small CPU has use for
+
+
+@pytree
+class Evidence:
+    """How a pair of objects fits at the best pose found."""
+
+    of_source: Float[
+        Array, "*pairs"
+    ]  # mean truncated distance of the source's points, in shares of the truncation
+    of_target: Float[Array, "*pairs"]  # and of the target's
+    lift: Float[Array, "*pairs"]  # change of height, metres
+    radius: Float[Array, "*pairs"]  # of the target, metres
+
+
+@partial(jax.jit, static_argnames=("config", "upright"))
+def pair_evidence(
+    source: PointCloud,
+    target: PointCloud,
+    source_code: Embedding,
+    target_code: Embedding,
+    offset: Float[Array, "n m 3"],
+    pairs: Int[Array, "p 2"],
+    config: RegistrationConfig,
+    upright: bool,
+) -> Evidence:
+    """Fits `pairs` (row of `source`, row of `target`) of two batches of clouds.
+
+    `offset`: where the source's local zero lies as the target sees it, when the scans share a frame, metres.
+    """
+
+    def prepared(cloud: PointCloud) -> Surface:
+        def one(row: tuple[Array, Array]) -> Surface:
+            points, mask = row
+            return coarse_of(whole_surface(points, mask), config)
+
+        return jax.lax.map(one, (cloud.points, cloud.mask))
+
+    sources, targets = prepared(source), prepared(target)
+    radius = jax.vmap(cloud_radius)(target.points, target.mask)
+
+    def one(index: Int[Array, "2"]) -> Evidence:
+        s, s_code = jax.tree.map(lambda x: x[index[0]], (sources, source_code))
+        t, t_code, r = jax.tree.map(lambda x: x[index[1]], (targets, target_code, radius))
+        return fit(s, t, s_code, t_code, offset[index[0], index[1]], r, config, upright)
+
+    return jax.lax.map(one, pairs, batch_size=AT_ONCE)
+
+
+def fit(
+    source: Surface,
+    target: Surface,
+    source_code: Embedding,
+    target_code: Embedding,
+    offset: Float[Array, "3"],
+    radius: Float[Array, ""],
+    config: RegistrationConfig,
+    upright: bool,
+) -> Evidence:
+    """One pair."""
+    s, t = (scale_surface(x, 1 / radius) for x in (source, target))
+    codes = (scale_embedding(c, 1 / radius) for c in (source_code, target_code))
+    a, b = codes
+    pair = Pair(source=s.sampled, target=t.sampled, source_code=a, target_code=b, offset=offset / radius)
+    starts = candidate_poses(pair, config, upright)
+    config = dataclasses.replace(config, keep_starts=1)
+    poses, _ = search(starts, s, t, pair.offset, config, upright)
+    T = jax.tree.map(lambda x: x[0], poses)
+    there, back = misfits_both_ways(T, s, t, (config.truncation,))
+    lift = jnp.abs(T.translation()[2] - pair.offset[2]) * radius
+    return Evidence(of_source=there, of_target=back, lift=lift, radius=radius)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Compared:
+    """What is known of pairs without aligning them."""
+
+    size: Float[np.ndarray, "*pairs"]  # |log| of the ratio of the F_s
+    likeness: Float[np.ndarray, "*pairs"]  # cosine of the F_inv
+    top_m: Float[np.ndarray, "*pairs"]  # difference of the heights of their highest points
+
+
+@dataclass(frozen=True, kw_only=True)
+class Calibration:
+    """Log odds that two clouds show one object, linear in what is known of the pair (docs/relocalisation.md)."""
+
+    intercept: float
+    nearer: float  # of the smaller mean truncated distance of the two ways,
+    farther: float  # and of the larger
+    size: float
+    likeness: float
+    lift: float = 0.0  # of a change of height, in shares of `LIFTED` of the radius, at most 1
+    top: float = 0.0  # of `top_m`, in shares of the radius, at most `HIGHEST`
+
+
+HIGHEST = 0.2
+# Logistic regression on pairs of validation rooms; how, and how well it holds, is in docs/relocalisation.md.
+UPRIGHT = Calibration(intercept=3.7, nearer=-6.9, farther=-1.0, size=-2.7, likeness=2.6, lift=-2.5, top=-21.0)
+FREE = Calibration(intercept=1.2, nearer=-9.9, farther=-3.3, size=-4.2, likeness=5.7)
+
+
+def log_odds(evidence: Evidence, compared: Compared, upright: bool) -> Float[np.ndarray, "*pairs"]:
+    """Of every pair to be one object; `upright`: of scans that share a frame, in which things stand on a floor."""
+    c, radius = UPRIGHT if upright else FREE, np.asarray(evidence.radius)
+    ways = np.stack([evidence.of_source, evidence.of_target])
+    lift = np.minimum(np.asarray(evidence.lift) / (LIFTED * radius), 1.0)
+    top = np.minimum(compared.top_m / radius, HIGHEST)
+    fit = c.intercept + c.nearer * ways.min(axis=0) + c.farther * ways.max(axis=0)
+    return fit + c.size * compared.size + c.likeness * compared.likeness + c.lift * lift + c.top * top

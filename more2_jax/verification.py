@@ -1,0 +1,129 @@
+"""Who is who, decided by geometry: the embedding proposes pairs, surfaces say how likely each is one object.
+
+Beyond the paper (preset `robust`). An object and an instance are matched when they are likelier one than two; what
+is left over is removed or added, with the probability that it is.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.optimize import linear_sum_assignment
+from scipy.special import expit
+
+from more2_jax.batching import bucket
+from more2_jax.config import SceneConfig
+from more2_jax.encoding import at_zero, padded, stack, with_origin
+from more2_jax.evidence import Compared, log_odds, pair_evidence
+from more2_jax.types import Embedding
+
+Points = Float[np.ndarray, "_ 3"]
+LogOdds = Float[np.ndarray, "n m"]
+
+SMALLEST = 16  # pairs of a compiled call
+TOP = 0.99  # share of a cloud's points below its top
+AS_GOOD = 1.0  # of log odds: an exchange that loses less is as good
+NEVER = -np.inf  # log odds of a pair that is no candidate
+
+
+@dataclass(frozen=True, kw_only=True)
+class Known:
+    """An object or an instance as it is compared: points and embedding in one scan's frame."""
+
+    points: Points
+    embedding: Embedding
+
+
+def pair_log_odds(old: Sequence[Known], new: Sequence[Known], config: SceneConfig) -> LogOdds:
+    """Of every object to be every instance; `NEVER` where the embeddings and sizes propose better partners."""
+    known = compared(old, new)
+    proposal = known.likeness - config.matching.size_weight * known.size
+    candidates = proposed(proposal, config.matching.candidates)
+    rows = np.argwhere(candidates)
+    count = bucket(len(rows), SMALLEST)
+    target, source = (padded([k.points for k in side]) for side in (old, new))
+    codes = [
+        at_zero(with_origin(stack([k.embedding for k in side])[0], np.asarray(cloud.origin)))
+        for side, cloud in ((new, source), (old, target))
+    ]
+    offset = np.asarray(source.origin)[:, None] - np.asarray(target.origin)[None]
+    flat = [dataclasses.replace(c, origin=jnp.zeros((len(c.points), 3))) for c in (source, target)]
+    pairs = np.zeros((count, 2), np.int32)
+    pairs[: len(rows)] = rows[:, ::-1]
+    found = pair_evidence(
+        *flat,
+        *codes,
+        jnp.asarray(offset, jnp.float32),
+        jnp.asarray(pairs),
+        config.registration,
+        config.upright,
+    )
+    evidence = jax.tree.map(lambda x: np.asarray(x)[: len(rows)], jax.device_get(found))
+    result = np.full(proposal.shape, NEVER)
+    of_candidates = Compared(**{k: v[candidates] for k, v in vars(known).items()})
+    result[candidates] = log_odds(evidence, of_candidates, config.upright)
+    return result
+
+
+def compared(old: Sequence[Known], new: Sequence[Known]) -> Compared:
+    """Every object with every instance, by size, code and height."""
+    a, b = (np.array([float(k.embedding.scale) for k in side]) for side in (old, new))
+    x, y = (np.stack([np.asarray(k.embedding.inv, np.float64) for k in side]) for side in (old, new))
+    x, y = (v / np.maximum(np.linalg.norm(v, axis=1, keepdims=True), 1e-30) for v in (x, y))
+    top, other = (np.array([np.quantile(k.points[:, 2], TOP) for k in side]) for side in (old, new))
+    return Compared(size=np.abs(np.log(a[:, None] / b)), likeness=x @ y.T, top_m=np.abs(top[:, None] - other))
+
+
+def proposed(score: LogOdds, count: int) -> Bool[np.ndarray, "n m"]:
+    """True for the best `count` of every row and of every column; all where `count` is 0."""
+    if not count:
+        return np.ones(score.shape, bool)
+    rows = np.argsort(np.argsort(-score, axis=1, kind="stable"), axis=1) < count
+    columns = np.argsort(np.argsort(-score, axis=0, kind="stable"), axis=0) < count
+    return rows | columns
+
+
+def assign(odds: LogOdds, moved_m: Float[np.ndarray, "n m"], weight: float) -> Int[np.ndarray, "p 2"]:
+    """The pairs (object, instance) of the likeliest assignment: none that is likelier two objects than one.
+
+    A metre moved takes `weight` off the log odds of pairs that are possible: it decides among identical copies.
+    """
+    possible = odds > 0
+    gain = np.where(possible, np.maximum(odds - weight * moved_m, 1e-6), 0.0)
+    rows = np.stack(linear_sum_assignment(-gain), axis=1)
+    return rows[possible[tuple(rows.T)]]
+
+
+def interchangeable(odds: LogOdds, pairs: Int[np.ndarray, "p 2"]) -> list[bool]:
+    """Of every pair, whether another assignment of it explains the scans as well: identical copies, as a rule."""
+    n, m = odds.shape
+    free_objects = sorted(set(range(n)) - set(pairs[:, 0]))
+    free_instances = sorted(set(range(m)) - set(pairs[:, 1]))
+
+    def exchanged(k: int, i: int) -> bool:
+        alone = [odds[k, j] for j in free_instances] + [odds[q, i] for q in free_objects]
+        if any(z > max(0.0, odds[k, i] - AS_GOOD) for z in alone):
+            return True
+        return any(
+            min(odds[k, j], odds[q, i]) > 0 and odds[k, j] + odds[q, i] > odds[k, i] + odds[q, j] - AS_GOOD
+            for q, j in pairs
+            if q != k
+        )
+
+    return [exchanged(int(k), int(i)) for k, i in pairs]
+
+
+def unmatched(odds: LogOdds, pairs: Int[np.ndarray, "p 2"]) -> tuple[dict[int, float], dict[int, float]]:
+    """Objects and instances left over, each with the probability that none of the others left over is it."""
+    n, m = odds.shape
+    objects = sorted(set(range(n)) - set(pairs[:, 0].tolist()))
+    instances = sorted(set(range(m)) - set(pairs[:, 1].tolist()))
+    alone = 1 - expit(odds[np.ix_(objects, instances)])
+    gone = {k: float(p) for k, p in zip(objects, alone.prod(axis=1), strict=True)}
+    return gone, {i: float(p) for i, p in zip(instances, alone.prod(axis=0), strict=True)}
