@@ -60,6 +60,9 @@ def scene_object(
             score=1.0 if s == scans[0] else 0.9,
             rms_m=0.0 if s == scans[0] else 0.01,
             converged=True,
+            interchangeable=number == 1 and s != scans[0],
+            sigma_m=0.0 if s == scans[0] else 0.001,
+            sigma_deg=0.0 if s == scans[0] else 0.1,
         )
         for s in scans
     ]
@@ -110,6 +113,7 @@ def living_scene() -> LivingScene:
                 static=(ids[0],),
                 added=(ids[3],),
                 removed=(ids[2], ids[4]),
+                probability={ids[1]: 0.99, ids[2]: 0.8},
             ),
             Changes(from_scan=1, to_scan=2, static=(ids[0], ids[1], ids[3]), added=(ids[4],)),
         ),

@@ -6,11 +6,11 @@ import dataclasses
 
 import numpy as np
 import pytest
-from factories import turn_z
+from factories import scene_object, turn_z
 
 from more2_jax import registration
 from more2_jax.config import JointConfig, preset
-from more2_jax.objects import apply_pose, points_of
+from more2_jax.objects import apply_pose, moved_probability, points_of
 from more2_jax.scene import add_scan, reconstruct, start_scene
 from more2_jax.types import Instance, Mesh, Scan
 
@@ -81,6 +81,49 @@ def test_changes_name_what_stayed_moved_came_and_went(scene):
         (ids["kind 2"],),
         (ids["kind 1"],),
     )
+
+
+def test_all_that_is_said_of_changes_has_a_probability(scene):
+    for c in scene.changes:
+        assert set(c.probability) == {*c.static, *c.moved, *c.added, *c.removed}
+        assert all(0.5 < p <= 1 for p in c.probability.values())
+    assert not any(seen.interchangeable for o in scene.objects for seen in o.observations)
+
+
+@pytest.mark.parametrize(
+    ("shift_m", "sigma_m", "low", "high"),
+    [
+        (0.06, 0.0, 1, 1),  # without an error of its own: what the limits say
+        (0.04, 0.0, 0, 0),
+        (0.06, 0.001, 0.99, 1),
+        (0.06, 0.05, 0, 0.5),  # less than registration's own error explains
+        (0.04, 0.05, 0, 0.5),
+        (1.0, 0.05, 0.99, 1),
+    ],
+)
+def test_a_motion_within_registrations_own_error_is_none(shift_m, sigma_m, low, high):
+    shifted = turn_z(0.0, np.zeros(3), np.array([shift_m, 0, 0]))
+    o = scene_object(0, {0: np.eye(4), 1: shifted})
+    before, after = (dataclasses.replace(seen, sigma_m=0.0, sigma_deg=0.0) for seen in o.observations)
+    moved = moved_probability(o, before, dataclasses.replace(after, sigma_m=sigma_m), CONFIG)
+    assert low <= moved <= high
+
+
+def test_identical_copies_are_matched_one_to_one_and_flagged(tiny_prior):
+    def twins(name: str, at: list[float]) -> Scan:
+        clouds = [piece(0) + [x, 0, 0] for x in at]
+        return Scan(
+            name=name,
+            source=name,
+            instances=tuple(Instance(id=k, points=c) for k, c in enumerate(clouds)),
+        )
+
+    made = start_scene(tiny_prior, twins("a", [0.0, 3.0]), CONFIG)
+    made = add_scan(tiny_prior, made, twins("b", [3.0, 0.0]), CONFIG)
+    seen = [o.observations[1] for o in made.objects]
+    assert [s.instance for s in seen] == [1, 0]  # each where it stood
+    assert all(s.interchangeable for s in seen)
+    assert made.changes[0].static == tuple(o.id for o in made.objects)
 
 
 def test_every_pose_maps_its_observation_onto_the_reference(scene):
