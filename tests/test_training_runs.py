@@ -1,8 +1,9 @@
-"""A run on many devices, or killed on its way is the run on one device that was let be."""
+"""A run on many devices, on two processes, or killed on its way is the run on one device that was let be."""
 
 import json
 import os
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -108,6 +109,26 @@ def test_four_devices_take_the_steps_of_one_each_doing_its_share(made):
     assert np.median(off) < 1e-6 and np.quantile(off, 0.99) < 1e-4 and off.max() < 4e-3
     # By the compiler's count, which is of one device: the work is split, not repeated.
     assert four["flops"] < 0.45 * one["flops"]
+
+
+@pytest.mark.slow
+def test_two_processes_end_where_one_does(made):
+    with socket.socket() as free:
+        free.bind(("localhost", 0))
+        address = f"localhost:{free.getsockname()[1]}"
+    how = [("--coordinator", address, "--processes", "2", "--process", str(k)) for k in range(2)]
+    for process in [started(made, "together", *more) for more in how]:
+        finish(process)
+    a, b = (weights(made / k / "weights.npz") for k in ("alone", "together"))
+    # Half-precision files of weights that 60 steps moved by 0.01 and more.
+    assert np.median(np.abs(a - b)) < 1e-4 and np.abs(a - b).max() < 0.01
+    alone, together = (
+        [json.loads(x) for x in (made / k / "log.jsonl").read_text().splitlines()]
+        for k in ("alone", "together")
+    )
+    assert [x["step"] for x in alone] == [x["step"] for x in together] == [20, 40, 60]
+    for x, y in zip(alone, together, strict=True):
+        assert x["train"] == pytest.approx(y["train"], rel=1e-2)
 
 
 @pytest.mark.slow

@@ -26,6 +26,7 @@ def connect(coordinator: str, processes: int, process: int) -> None:
         if not 0 <= process < processes:
             raise ValueError(f"process {process} of {processes}; needed 0 to {processes - 1}")
         jax.distributed.initialize(coordinator, processes, process)
+        meet()
         return
     address = next((os.environ[name] for name in IN_ENVIRONMENT if os.environ.get(name)), "")
     if address == "auto":
@@ -34,6 +35,17 @@ def connect(coordinator: str, processes: int, process: int) -> None:
     elif address:
         count, me = os.environ.get("JAX_PROCESS_COUNT"), os.environ.get("JAX_PROCESS_ID")
         jax.distributed.initialize(address, int(count) if count else None, int(me) if me else None)
+    meet()
+
+
+def meet() -> None:
+    """Exchanges something with the other processes as soon as they are there.
+
+    On CPUs the first exchange opens the connections, and fails if another process comes to it over 30 seconds later;
+    after that there is time. Between here and the first step every process reads, initialises and compiles for itself.
+    """
+    if jax.process_count() > 1:
+        multihost_utils.sync_global_devices("connected")
 
 
 def device_mesh(batch: int) -> Mesh:
