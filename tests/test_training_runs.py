@@ -112,23 +112,28 @@ def test_four_devices_take_the_steps_of_one_each_doing_its_share(made):
 
 
 @pytest.mark.slow
-def test_two_processes_end_where_one_does(made):
+def test_two_processes_end_where_one_does(tmp_path):
+    few = SETTINGS.replace("steps: 60", "steps: 4").replace("validate_every: 20", "validate_every: 2")
+    (tmp_path / "settings.yaml").write_text(few)
+    sphere_shards(tmp_path)
     with socket.socket() as free:
         free.bind(("localhost", 0))
         address = f"localhost:{free.getsockname()[1]}"
     how = [("--coordinator", address, "--processes", "2", "--process", str(k)) for k in range(2)]
-    for process in [started(made, "together", *more) for more in how]:
+    for process in [started(tmp_path, "together", *more) for more in how]:
         finish(process)
-    a, b = (weights(made / k / "weights.npz") for k in ("alone", "together"))
-    # Half-precision files of weights that 60 steps moved by 0.01 and more.
-    assert np.median(np.abs(a - b)) < 1e-4 and np.abs(a - b).max() < 0.01
+    finish(started(tmp_path, "alone"))
+    off = np.abs(np.subtract(*(weights(tmp_path / k / "weights.npz") for k in ("alone", "together"))))
+    # Where a gradient is rounding alone, Adam makes a step of it all the same: 1e-3, four times.
+    assert np.quantile(off, 0.99) < 1e-6 and off.max() < 4e-3
     alone, together = (
-        [json.loads(x) for x in (made / k / "log.jsonl").read_text().splitlines()]
+        [json.loads(x) for x in (tmp_path / k / "log.jsonl").read_text().splitlines()]
         for k in ("alone", "together")
     )
-    assert [x["step"] for x in alone] == [x["step"] for x in together] == [20, 40, 60]
+    assert [x["step"] for x in alone] == [x["step"] for x in together] == [2, 4]
     for x, y in zip(alone, together, strict=True):
-        assert x["train"] == pytest.approx(y["train"], rel=1e-2)
+        assert x["train"] == pytest.approx(y["train"], rel=1e-5)
+        assert x["val"] == pytest.approx(y["val"], rel=1e-4)
 
 
 @pytest.mark.slow
