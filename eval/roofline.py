@@ -71,7 +71,7 @@ def main(
         out.write_text(json.dumps(said | {"cores": len(os.sched_getaffinity(0))}, indent=1) + "\n")
 
 
-WITHOUT_GRADIENT = ("sampling", "farthest points", "neighbours of 1024")
+WITHOUT_GRADIENT = ("sampling", "farthest points", "neighbours")
 
 
 def _total(tree: Any) -> Array:
@@ -132,7 +132,7 @@ def pieces(run_: TrainingRun, clouds: int, queries: int) -> dict[str, Piece]:
     found: dict[str, Piece] = {
         "sampling": (drawn, (shapes,)),
         "farthest points": (jax.vmap(lambda p, m: farthest_points(p, m, len(p))), (points, mask)),
-        "neighbours of 1024": (
+        "neighbours": (
             jax.vmap(lambda f, m: nearest_features(f, f, m, model.encoder.neighbours)),
             (features, mask),
         ),
