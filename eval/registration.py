@@ -103,11 +103,13 @@ def main(options: Annotated[Settings, tyro.conf.arg(name="")]) -> None:
 
 
 def own_settings(name: str, upright: bool) -> dict[str, RegistrationConfig]:
-    """The preset's registration, with and without its descent on the loss."""
+    """The preset's registration, with and without what follows the coarse search of starts."""
     config = preset(name, upright=upright).registration
     return {
         f"ours, {name}": config,
-        f"ours, {name}, without optimisation": dataclasses.replace(config, steps=0),
+        f"ours, {name}, without optimisation": dataclasses.replace(
+            config, steps=0, surface_steps=0, polish_steps=0
+        ),
     }
 
 
