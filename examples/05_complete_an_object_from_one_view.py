@@ -23,7 +23,9 @@ view = seen[seen[:, 0] > np.median(seen[:, 0])]  # only the half towards +x
 prior = m2.load_prior("small")
 code = jax.tree.map(lambda x: np.asarray(x)[0], m2.encode(prior, m2.pad_clouds([view])))
 config = m2.preset("robust").meshing
-mesh = m2.extract_mesh(prior, code, config, half_width=0.9, level=observed_level(prior, code, view))
+mesh = m2.extract_mesh(
+    prior, code, config, half_width=0.9, level=observed_level(prior, code, view), seen=view
+)
 if mesh is None:
     raise SystemExit("the field has no surface at this level")
 
