@@ -147,13 +147,27 @@ SCHEMA = exactly(
                     score={"type": "number"},
                     rms_m={"type": "number", "minimum": 0},
                     converged={"type": "boolean"},
+                    interchangeable={"type": "boolean"},
+                    sigma_m={"type": "number", "minimum": 0},
+                    sigma_deg={"type": "number", "minimum": 0},
                 ),
             },
         ),
     },
     changes={
         "type": "array",
-        "items": exactly(**{"from": INDEX, "to": INDEX}, moved=IDS, static=IDS, added=IDS, removed=IDS),
+        "items": exactly(
+            **{"from": INDEX, "to": INDEX},
+            moved=IDS,
+            static=IDS,
+            added=IDS,
+            removed=IDS,
+            probability={
+                "type": "object",
+                "propertyNames": {"pattern": "^object_[0-9]{3,}$"},
+                "additionalProperties": {"type": "number", "minimum": 0, "maximum": 1},
+            },
+        ),
     },
 )
 
