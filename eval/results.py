@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import importlib.metadata
-import sys
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
@@ -45,13 +44,27 @@ def finish(
 def provenance(run: Run, o: Options) -> dict[str, Any]:
     """Command, data, settings, hardware, versions: what a figure belongs to."""
     return {
-        "command": portable(["python", "-m", f"eval.{run.settings['program']}", *sys.argv[1:]]),
+        "command": portable(words_of(o, run.settings["program"])),
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
         "hardware": hardware(),
         "versions": {p: _version(p) for p in ("jax", "open3d-cpu", "small-gicp", "kiss-matcher")},
         "scenes_asked": o.scenes or len(run.data.names),
         "settings": run.settings,
     }
+
+
+def words_of(o: Options, program: str) -> list[str]:
+    """The command line of a run: what differs from the defaults, however the run was started."""
+    words = ["python", "-m", f"eval.{program}"]
+    for f in dataclasses.fields(o):
+        value, flag = getattr(o, f.name), f.name.replace("_", "-")
+        if value == f.default or f.name == "fresh":
+            continue
+        if isinstance(value, bool):
+            words.append(f"--{flag}" if value else f"--no-{flag}")
+        else:
+            words += [f"--{flag}", *map(str, value if isinstance(value, tuple) else (value,))]
+    return words
 
 
 def portable(words: Sequence[str]) -> str:

@@ -1,9 +1,15 @@
 """Figures from records: every statistic by hand, failures in every denominator, intervals over scenes, tables."""
 
+import dataclasses
+from pathlib import Path
+
 import numpy as np
 import pytest
+import tyro
 
+from eval import registration
 from eval.figures import Figure, figure_row, in_columns, rows_of
+from eval.results import portable, words_of
 from eval.tables import best, latex, markdown, markdown_table, number
 
 A = {"one": [{"method": "m", "e": 1.0}, {"method": "m", "e": 9.0}], "two": [{"method": "m", "e": None}]}
@@ -135,3 +141,13 @@ def test_columns_that_say_the_same_share_a_line():
     both = [rows_of(in_columns(figure("mean")), records) for records in (one, other)]
     assert [len(markdown_table(rows).splitlines()) - 2 for rows in both] == [1, 3]
     assert "| f | 1 | 1 |" in markdown_table(both[0]) and "| f, strict | 1 | 2 |" in markdown_table(both[1])
+
+
+def test_the_command_of_a_run_is_read_back_as_its_options():
+    asked = registration.Settings(
+        data=Path("here/rooms"), out=Path("there"), scenes=3, peers=False, preset="paper", fresh=True
+    )
+    words = words_of(asked, "registration")
+    assert words[:3] == ["python", "-m", "eval.registration"]
+    assert tyro.cli(registration.Settings, args=words[3:]) == dataclasses.replace(asked, fresh=False)
+    assert portable(["--data", "/far/away/rooms", "3"]) == "--data rooms 3"
