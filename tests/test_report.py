@@ -147,6 +147,13 @@ def doubtful(**seen) -> Verdict:
     return verdict(dataclasses.replace(o, observations=(o.observations[0], worse)), SCENE.changes[0])
 
 
+def test_a_change_of_little_probability_is_told_as_unsure():
+    o, changes = SCENE.objects[0], SCENE.changes[0]
+    for chance, doubts in ((0.9, 0), (0.55, 1)):
+        found = verdict(o, dataclasses.replace(changes, probability={o.id: chance}))
+        assert len(found.doubts) == doubts and all("probability of 55%" in d for d in found.doubts)
+
+
 def test_doubts_are_told():
     assert doubtful().doubts == ()
     assert doubtful(converged=False).doubts == ("its new position did not settle",)

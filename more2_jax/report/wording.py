@@ -12,6 +12,7 @@ from more2_jax.objects import changes_between, motion_between, observation_in
 from more2_jax.types import Changes, LivingScene, Observation, SceneObject
 
 LOW_SCORE = 0.3  # a match below it is told as unsure; same objects usually score 0.5 to 0.9
+UNLIKELY = 0.6  # as is a change that is less probable than this
 
 Status = Literal["moved", "static", "added", "removed", "present", "absent"]
 STATES: tuple[Status, ...] = ("moved", "added", "removed", "static")
@@ -41,6 +42,9 @@ def verdict(o: SceneObject, changes: Changes) -> Verdict:
         return Verdict(status="present" if after else "absent", doubts=doubts)
     told: list[Status] = [s for s in STATES if o.id in getattr(changes, s)]
     status = told[0] if told else "absent"
+    chance = changes.probability.get(o.id, 1.0)
+    if told and chance < UNLIKELY:
+        doubts += (f"{status} with a probability of {chance:.0%} only",)
     if before is None or after is None:
         return Verdict(status=status, doubts=doubts)
     distance_m, angle_deg = motion_between(o, before, after)
