@@ -68,7 +68,7 @@ def main(options: Annotated[Settings, tyro.conf.arg(name="")]) -> None:
         found = scene_records(scene, current.prior, current.config, right_deg, options.samples)
         return [{"method": f"ours, {options.preset}", **r} for r in found]
 
-    records = run_scenes(current, options, lambda scenes: on_all_devices(one, scenes))
+    records = run_scenes(current, options, lambda scenes: on_all_devices(one, scenes, options.at_once))
     rows = finish(current, options, FIGURES, records, ("scans",))
     draw_over_scans(current.out / "accumulation", rows, PLOTTED)
 

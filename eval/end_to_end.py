@@ -2,7 +2,7 @@
 
 `python -m eval.end_to_end --data data/flying_sparse --out runs/end_to_end --scenes 10`
 
-Scenes are spread over the devices of a host, one a device at a time, and over hosts.
+Scenes are spread over the devices of a host, `--at-once` on each, and over hosts.
 """
 
 from __future__ import annotations
@@ -71,23 +71,23 @@ def main(options: Annotated[Settings, tyro.conf.arg(name="")]) -> None:
             for r in records_of(scene, n, m, current.data.right_deg, options.samples)
         ]
 
-    records = run_scenes(current, options, lambda scenes: on_all_devices(one, scenes))
+    records = run_scenes(current, options, lambda scenes: on_all_devices(one, scenes, options.at_once))
     finish(current, options, figures(), records, ("to_scan", "category"))
 
 
 def on_all_devices(
-    one: Callable[[KnownScene], list[Record]], scenes: Sequence[KnownScene]
+    one: Callable[[KnownScene], list[Record]], scenes: Sequence[KnownScene], at_once: int = 1
 ) -> list[list[Record]]:
-    """A thread for each local device; each scene's programs run on the device of its thread."""
+    """`at_once` threads for each local device; each scene's programs run on the device of its thread."""
     devices = jax.local_devices()
-    if len(devices) == 1:
+    if len(devices) * at_once == 1:
         return [one(s) for s in scenes]
 
     def placed(scene: KnownScene, device: Any) -> list[Record]:
         with jax.default_device(device):
             return one(scene)
 
-    with ThreadPoolExecutor(len(devices)) as pool:
+    with ThreadPoolExecutor(len(devices) * at_once) as pool:
         return list(pool.map(placed, scenes, itertools.cycle(devices)))
 
 

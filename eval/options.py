@@ -41,6 +41,9 @@ class Options:
     """Scenes that share a batch."""
     batch: int = 16
     """Clouds or pairs a compiled call takes; shared by all devices."""
+    at_once: int = 1
+    """Scenes that a device works on at the same time, where whole scenes are its unit: one for every core keeps a
+    CPU busy. Times of a scene then include waiting for the others."""
     split: Literal["train", "validation", "test"] = "validation"
     """Of 3rscan."""
     fresh: bool = False
@@ -53,10 +56,10 @@ def benchmark(o: Options) -> Benchmark:
     """The data. Raises ValueError if there are none of that kind, or the masks are not to be had."""
     if not o.data.is_dir():
         raise ValueError(f"{o.data}: no such folder")
-    if o.scenes < 0 or o.visits < 0 or o.visits == 1 or o.chunk < 1 or o.batch < 1:
+    if o.scenes < 0 or o.visits < 0 or o.visits == 1 or min(o.chunk, o.batch, o.at_once) < 1:
         raise ValueError(
-            f"scenes {o.scenes}, visits {o.visits}, chunk {o.chunk}, batch {o.batch}; needed 0 (all) or more,"
-            " two visits at least, positive chunk and batch"
+            f"scenes {o.scenes}, visits {o.visits}, chunk {o.chunk}, batch {o.batch}, at once {o.at_once}; needed 0"
+            " (all) or more, two visits at least, positive chunk, batch and number at once"
         )
     if o.dataset == "3rscan":
         return threerscan(o.data, split=o.split, predicted=o.masks == "predicted")

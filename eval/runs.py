@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import itertools
 import json
 import os
 import platform
 import shutil
 import sys
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -115,8 +117,7 @@ def run_scenes(run: Run, o: Options, work: Work) -> dict[str, list[Record]]:
     todo = [n for n in mine if not run.file(n).exists()]
     with progress_bar() as bar:
         task = bar.add_task(run.settings["program"], total=len(mine), completed=len(mine) - len(todo))
-        for names in chunks(todo, o.chunk):
-            scenes = [masked(run.data.read(n).first_scans(o.visits), o.masks) for n in names]
+        for names, scenes in read_ahead(run, o, todo):
             for name, records in zip(names, work(scenes), strict=True):
                 write_json(run.file(name), records)
                 bar.advance(task)
@@ -125,6 +126,22 @@ def run_scenes(run: Run, o: Options, work: Work) -> dict[str, list[Record]]:
 
         multihost_utils.sync_global_devices(run.settings["program"])
     return run.records()
+
+
+def read_ahead(run: Run, o: Options, todo: Sequence[str]) -> Iterator[tuple[Sequence[str], list[KnownScene]]]:
+    """The scenes of a chunk and their names; the next chunk is read while this one is worked on."""
+
+    def read(names: Sequence[str]) -> list[KnownScene]:
+        return [masked(run.data.read(n).first_scans(o.visits), o.masks) for n in names]
+
+    parts = list(chunks(todo, o.chunk))
+    with ThreadPoolExecutor(1) as reader:
+        coming = [reader.submit(read, names) for names in parts[:1]]
+        for names, following in itertools.zip_longest(parts, parts[1:]):
+            scenes = coming.pop().result()
+            if following:
+                coming.append(reader.submit(read, following))
+            yield names, scenes
 
 
 def masked(scene: KnownScene, masks: str) -> KnownScene:

@@ -20,7 +20,10 @@ from more2_jax.prior import Prior, sdf_one
 from more2_jax.seen_surface import SeenSurface, seen_surface, some_of
 from more2_jax.types import Embedding, Mesh
 
-CHUNK = 8192  # queries a call: one compiled program for every object and resolution
+# Queries a call: one compiled program for every object and resolution. On a CPU the layers' values should stay in the
+# caches (2048 take 0.6 times as long as 8192 at a time); accelerators want large products.
+CHUNK = {"cpu": 2048}
+CHUNK_OF_OTHERS = 32768
 
 _values = jax.jit(sdf_one)
 _slopes = jax.jit(jax.grad(lambda *asked: sdf_one(*asked).sum(), argnums=2))
@@ -103,10 +106,11 @@ def _in_chunks(
     """What `of` gives at canonical offsets, asked for in chunks of one fixed size."""
     local = dataclasses.replace(embedding, origin=jnp.zeros(3))
     points = (queries * float(embedding.scale) + np.asarray(embedding.center)).astype(np.float32)
-    padded = np.zeros((-(-max(len(points), 1) // CHUNK) * CHUNK, 3), np.float32)
+    chunk = CHUNK.get(jax.default_backend(), CHUNK_OF_OTHERS)
+    padded = np.zeros((-(-max(len(points), 1) // chunk) * chunk, 3), np.float32)
     padded[: len(points)] = points
-    parts = [np.asarray(of(prior, local, jnp.asarray(chunk))) for chunk in padded.reshape(-1, CHUNK, 3)]
-    return np.concatenate(parts)[: len(points)]
+    parts = [of(prior, local, part) for part in padded.reshape(-1, chunk, 3)]
+    return np.concatenate(jax.device_get(parts))[: len(points)]
 
 
 def _refine(
