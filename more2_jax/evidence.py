@@ -12,6 +12,7 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
+import jaxlie
 import numpy as np
 from jax import Array
 from jaxtyping import Float, Int
@@ -23,6 +24,7 @@ from more2_jax.starts import Pair, candidate_poses
 from more2_jax.surface_registration import LIFTED, coarse_of, misfits_both_ways, search
 from more2_jax.types import Embedding, PointCloud, pytree, scale_embedding
 
+HYPOTHESES = 4  # poses of a pair that are remembered: the best, and others turned otherwise
 AT_ONCE = 8  # pairs aligned side by side: as many as a small CPU has use for
 
 
@@ -36,6 +38,7 @@ class Evidence:
     of_target: Float[Array, "*pairs"]  # and of the target's
     lift: Float[Array, "*pairs"]  # change of height, metres
     radius: Float[Array, "*pairs"]  # of the target, metres
+    poses: jaxlie.SE3  # (*pairs, `HYPOTHESES`): source's local frame to target's, best first, metres
 
 
 @partial(jax.jit, static_argnames=("config", "upright"))
@@ -88,12 +91,13 @@ def fit(
     a, b = codes
     pair = Pair(source=s.sampled, target=t.sampled, source_code=a, target_code=b, offset=offset / radius)
     starts = candidate_poses(pair, config, upright)
-    config = dataclasses.replace(config, keep_starts=1)
+    config = dataclasses.replace(config, keep_starts=HYPOTHESES)
     poses, _ = search(starts, s, t, pair.offset, config, upright)
     T = jax.tree.map(lambda x: x[0], poses)
     there, back = misfits_both_ways(T, s, t, (config.truncation,))
     lift = jnp.abs(T.translation()[2] - pair.offset[2]) * radius
-    return Evidence(of_source=there, of_target=back, lift=lift, radius=radius)
+    in_metres = jaxlie.SE3.from_rotation_and_translation(poses.rotation(), poses.translation() * radius)
+    return Evidence(of_source=there, of_target=back, lift=lift, radius=radius, poses=in_metres)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -14,7 +14,7 @@ import os
 import shutil
 import zipfile
 import zlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +28,7 @@ from more2_jax.types import (
     Anchors,
     Changes,
     Embedding,
+    Frame,
     LivingScene,
     Observation,
     ScanRecord,
@@ -193,6 +194,11 @@ def scene_to_json(scene: LivingScene) -> dict[str, Any]:
                 "source": s.source,
                 "instances": [int(i) for i in s.instances],
                 "skipped": [{"what": k.what, "reason": k.reason} for k in s.skipped],
+                "frame": {
+                    "T_scene_scan": np.asarray(s.frame.T_scene_scan, np.float64).tolist(),
+                    "sigma_m": float(s.frame.sigma_m),
+                    "sigma_deg": float(s.frame.sigma_deg),
+                },
             }
             for s in scene.scans
         ],
@@ -267,16 +273,18 @@ def _scene(folder: Path, content: dict[str, Any]) -> LivingScene:
             "instances": tuple(s["instances"]),
             "skipped": tuple(Skipped(**k) for k in s.get("skipped", [])),
             "background": background[owner == s["index"]],
+            "frame": _frame(s.get("frame")),
         }
         for s in content["scans"]
     ]
+    frames = {s["index"]: s["frame"] for s in scans}
     kinds = ("moved", "static", "added", "removed")
     return LivingScene(
         preset=content["preset"],
         prior=content["prior"],
         upright=content["upright"],
         scans=tuple(ScanRecord(**s) for s in scans),
-        objects=tuple(_object(folder, o, embeddings[o["id"]]) for o in content["objects"]),
+        objects=tuple(_object(folder, o, embeddings[o["id"]], frames) for o in content["objects"]),
         changes=tuple(
             Changes(
                 from_scan=c["from"],
@@ -320,9 +328,22 @@ def _embeddings(path: Path) -> dict[str, Embedding]:
     return {str(i): one(n) for n, i in enumerate(stacked["id"])}
 
 
-def _object(folder: Path, o: dict[str, Any], embedding: Embedding) -> SceneObject:
+def _frame(content: dict[str, Any] | None) -> Frame:
+    """The frame of a scan; that of the scene where the file names none."""
+    if content is None:
+        return Frame()
+    T = np.array(content["T_scene_scan"], np.float64)
+    return Frame(T_scene_scan=T, sigma_m=content["sigma_m"], sigma_deg=content["sigma_deg"])
+
+
+def _object(
+    folder: Path, o: dict[str, Any], embedding: Embedding, frames: Mapping[int, Frame]
+) -> SceneObject:
     points, point_scan = read_points(folder / o["points"])
-    seen = [s | {"T_ref_scan": np.array(s["T_ref_scan"], np.float64)} for s in o["observations"]]
+    seen = [
+        s | {"T_ref_scan": np.array(s["T_ref_scan"], np.float64), "frame": frames[s["scan"]]}
+        for s in o["observations"]
+    ]
     return SceneObject(
         id=o["id"],
         label=o["label"],

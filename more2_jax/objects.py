@@ -11,20 +11,29 @@ from scipy.special import ndtr
 
 from more2_jax.config import SceneConfig
 from more2_jax.metrics import apply_pose, rotation_error_deg
-from more2_jax.types import Changes, Embedding, Instance, Observation, SceneObject
+from more2_jax.types import Changes, Embedding, Frame, Instance, Observation, SceneObject
 
 Pose = Float[np.ndarray, "4 4"]
 Points = Float[np.ndarray, "n 3"]
 
 # Registration takes correspondences as independent: true errors are larger than it says, by about this much.
 OPTIMISM = 3.0
+SCENE_FRAME = Frame()  # that of the first scan
 SURE = 2.0  # standard errors that a motion must exceed
 
 
-def new_object(number: int, scan: int, instance: Instance, embedding: Embedding) -> SceneObject:
-    """An object seen for the first time: this observation is its reference."""
+def new_object(
+    number: int, scan: int, instance: Instance, embedding: Embedding, frame: Frame = SCENE_FRAME
+) -> SceneObject:
+    """An object seen for the first time: this observation is its reference. `frame`: of the scan."""
     own = Observation(
-        scan=scan, instance=instance.id, T_ref_scan=np.eye(4), score=1.0, rms_m=0.0, converged=True
+        scan=scan,
+        instance=instance.id,
+        T_ref_scan=np.eye(4),
+        score=1.0,
+        rms_m=0.0,
+        converged=True,
+        frame=frame,
     )
     return SceneObject(
         id=f"object_{number:03d}",
@@ -59,16 +68,21 @@ def observation_in(o: SceneObject, scan: int) -> Observation | None:
 
 
 def last_center(o: SceneObject) -> Float[np.ndarray, "3"]:
-    """Where the object was when last seen: its accumulated cloud's mean, in that scan's frame."""
-    return apply_pose(np.linalg.inv(o.observations[-1].T_ref_scan), o.points.mean(axis=0, keepdims=True))[0]
+    """Where the object was when last seen: its accumulated cloud's mean, in the scene's frame."""
+    return apply_pose(place_of(o.observations[-1]), o.points.mean(axis=0, keepdims=True))[0]
+
+
+def place_of(seen: Observation) -> Pose:
+    """T_scene_ref: takes an object's points to where an observation has them, in the scene's frame."""
+    return seen.frame.T_scene_scan @ np.linalg.inv(seen.T_ref_scan)
 
 
 def motion_between(o: SceneObject, before: Observation, after: Observation) -> tuple[float, float]:
-    """How far (metres, at the object's mean) and by what angle (degrees) it moved, if both scans share a frame."""
-    T_after_before = np.linalg.inv(after.T_ref_scan) @ before.T_ref_scan
-    center = apply_pose(np.linalg.inv(before.T_ref_scan), o.points.mean(axis=0, keepdims=True))
-    distance = float(np.linalg.norm(apply_pose(T_after_before, center) - center))
-    return distance, float(rotation_error_deg(T_after_before[:3, :3], np.eye(3)))
+    """How far (metres, at the object's mean) and by what angle (degrees) it moved, in the scene's frame."""
+    first, then = place_of(before), place_of(after)
+    center = o.points.mean(axis=0, keepdims=True)
+    distance = float(np.linalg.norm(apply_pose(then, center) - apply_pose(first, center)))
+    return distance, float(rotation_error_deg(then[:3, :3], first[:3, :3]))
 
 
 def changes_between(
@@ -109,7 +123,10 @@ def moved_probability(o: SceneObject, before: Observation, after: Observation, c
         (distance, config.static_m, "sigma_m"),
         (angle_deg, config.static_deg, "sigma_deg"),
     ):
-        error = OPTIMISM * float(np.hypot(getattr(before, own), getattr(after, own)))
+        frames = [getattr(seen.frame, own) for seen in (before, after)]
+        error = float(
+            np.hypot(OPTIMISM * np.hypot(getattr(before, own), getattr(after, own)), np.hypot(*frames))
+        )
         limit = max(limit, SURE * error)
         found.append(float(ndtr((motion - limit) / error)) if error > 0 else float(motion > limit))
     return max(found)

@@ -10,12 +10,14 @@ import numpy as np
 from more2_jax.config import SceneConfig
 from more2_jax.encoding import embed
 from more2_jax.fitting import embed_accumulated, fit_objects
+from more2_jax.frames import Rooms
 from more2_jax.meshing import extract_mesh, observed_level
-from more2_jax.objects import changes_between, new_object, seen_again
+from more2_jax.metrics import apply_pose
+from more2_jax.objects import SCENE_FRAME, changes_between, new_object, seen_again
 from more2_jax.prior import Prior
 from more2_jax.progress import Watcher, staged
 from more2_jax.tracking import match_scan, register_scan
-from more2_jax.types import Instance, LivingScene, Mesh, Scan, ScanRecord, SceneObject, Skipped
+from more2_jax.types import Frame, Instance, LivingScene, Mesh, Scan, ScanRecord, SceneObject, Skipped
 
 BACKGROUND_POINTS = 20_000  # of a scan, remembered for the page
 
@@ -57,10 +59,11 @@ def add_scan(
     with stage("encode", len(instances)):
         embeddings = embed(prior, [i.points for i in instances])
     with stage("match", len(instances)):
-        identified = match_scan(objects, instances, embeddings, config)
+        identified = match_scan(objects, instances, embeddings, config, rooms_of(scene, scan))
+    frame = identified.frame
     found, chance = identified.found, {objects[k].id: p for k, p in identified.gone.items()}
     with stage("register", len(found), unit="pairs"):
-        seen = register_scan(prior, objects, instances, embeddings, found, index, config)
+        seen = register_scan(prior, objects, instances, embeddings, found, index, config, frame)
     for f, observation in zip(found, seen, strict=True):
         objects[f.object] = seen_again(objects[f.object], instances[f.instance], observation)
         if config.matching.verify:
@@ -70,11 +73,11 @@ def add_scan(
             objects = embed_accumulated(prior, objects, [f.object for f in found])
     known = {f.instance for f in found}
     for i in (i for i in range(len(instances)) if i not in known):
-        objects.append(new_object(len(objects), index, instances[i], embeddings[i]))
+        objects.append(new_object(len(objects), index, instances[i], embeddings[i], frame))
         chance |= {objects[-1].id: identified.new[i]} if i in identified.new else {}
     return dataclasses.replace(
         scene,
-        scans=(*scene.scans, record(index, scan, instances, skipped)),
+        scans=(*scene.scans, record(index, scan, instances, skipped, frame)),
         objects=tuple(objects),
         changes=(*scene.changes, changes_between(objects, index - 1, index, config, chance)),
         timing_s=timing,
@@ -131,7 +134,19 @@ def usable(scan: Scan, config: SceneConfig) -> tuple[list[Instance], tuple[Skipp
     return [i for i in scan.instances if len(i.points) >= need], (*scan.skipped, *skipped)
 
 
-def record(index: int, scan: Scan, instances: list[Instance], skipped: tuple[Skipped, ...]) -> ScanRecord:
+def rooms_of(scene: LivingScene, scan: Scan) -> Rooms:
+    """The background of the scan before and of a new one."""
+    last = scene.scans[-1]
+    return Rooms(scene=apply_pose(last.frame.T_scene_scan, last.background), scan=scan.background)
+
+
+def record(
+    index: int,
+    scan: Scan,
+    instances: list[Instance],
+    skipped: tuple[Skipped, ...],
+    frame: Frame = SCENE_FRAME,
+) -> ScanRecord:
     """What the scene remembers of a scan: of its background, points at even steps, `BACKGROUND_POINTS` at most."""
     return ScanRecord(
         index=index,
@@ -139,5 +154,6 @@ def record(index: int, scan: Scan, instances: list[Instance], skipped: tuple[Ski
         source=scan.source,
         instances=tuple(i.id for i in instances),
         skipped=skipped,
+        frame=frame,
         background=scan.background[:: max(1, -(-len(scan.background) // BACKGROUND_POINTS))],
     )

@@ -3,32 +3,33 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import jax
-import jax.numpy as jnp
-import jaxlie
 import numpy as np
 from jaxtyping import Float
 from scipy.special import expit
 
 from more2_jax.config import SceneConfig
 from more2_jax.encoding import padded, stack, with_origin
+from more2_jax.frames import Rooms, common_frame, moved
 from more2_jax.matching import match_instances
 from more2_jax.metrics import apply_pose
-from more2_jax.objects import Pose, last_center, observation_in, points_of
+from more2_jax.objects import SCENE_FRAME, Pose, last_center, observation_in, place_of, points_of
 from more2_jax.prior import Prior
 from more2_jax.registration import register, world_pose
 from more2_jax.types import (
     Embedding,
+    Frame,
     Instance,
     Observation,
     PointCloud,
     Registration,
     SceneObject,
-    move_embedding,
 )
-from more2_jax.verification import Known, assign, interchangeable, pair_log_odds, unmatched
+from more2_jax.verification import Known, assign, interchangeable, unmatched
+
+NO_ROOMS = Rooms()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,6 +49,7 @@ class Identified:
     found: tuple[Found, ...] = ()
     gone: dict[int, float] = field(default_factory=dict)  # object → probability that it is not in the scan
     new: dict[int, float] = field(default_factory=dict)  # instance → probability that it is no known object
+    frame: Frame = SCENE_FRAME  # of the scan
 
 
 def match_scan(
@@ -55,14 +57,16 @@ def match_scan(
     instances: Sequence[Instance],
     embeddings: Sequence[Embedding],
     config: SceneConfig,
+    rooms: Rooms = NO_ROOMS,
 ) -> Identified:
     """One assignment of all objects, present or absent just now, to the instances of a scan."""
     if config.matching.verify:
-        return verified(objects, instances, embeddings, config)
+        return verified(objects, instances, embeddings, config, rooms)
     old, real_old = stack([o.embedding for o in objects])
     new, real_new = stack(embeddings)
     bonus = np.zeros((len(real_old), len(real_new)), np.float32)
-    bonus[: len(objects), : len(instances)] = -config.matching.motion_weight * distances(objects, instances)
+    centers = np.stack([i.points.mean(axis=0) for i in instances])
+    bonus[: len(objects), : len(instances)] = -config.matching.motion_weight * distances(objects, centers)
     matches = match_instances(old, new, config.matching, real_old, real_new, bonus)
     index, score = np.asarray(matches.target_index), np.asarray(matches.score)
     pairs = [(k, int(index[k])) for k in range(len(objects)) if index[k] >= 0]
@@ -74,37 +78,34 @@ def verified(
     instances: Sequence[Instance],
     embeddings: Sequence[Embedding],
     config: SceneConfig,
+    rooms: Rooms,
 ) -> Identified:
-    """The assignment that geometry finds likeliest, with probabilities."""
+    """The assignment that geometry finds likeliest, with probabilities, and the frame of the scan."""
     old = [last_seen(o)[0] for o in objects]
     new = [Known(points=i.points, embedding=e) for i, e in zip(instances, embeddings, strict=True)]
-    odds = pair_log_odds(old, new, config)
-    pairs = assign(odds, distances(objects, instances), config.matching.motion_weight)
+    frame, fits = common_frame(old, new, config, rooms)
+    odds = fits.odds
+    centers = apply_pose(frame.T_scene_scan, np.stack([i.points.mean(axis=0) for i in instances]))
+    pairs = assign(odds, distances(objects, centers), config.matching.motion_weight)
     copies = interchangeable(odds, pairs)
     gone, fresh = unmatched(odds, pairs)
     found = tuple(
         Found(object=int(k), instance=int(i), score=float(expit(odds[k, i])), interchangeable=c)
         for (k, i), c in zip(pairs, copies, strict=True)
     )
-    return Identified(found=found, gone=gone, new=fresh)
+    return Identified(found=found, gone=gone, new=fresh, frame=frame)
 
 
-def distances(objects: Sequence[SceneObject], instances: Sequence[Instance]) -> Float[np.ndarray, "n m"]:
-    """Metres between where every object was last seen and every instance, in the frame the scans share."""
+def distances(objects: Sequence[SceneObject], centers: Float[np.ndarray, "m 3"]) -> Float[np.ndarray, "n m"]:
+    """Metres between where every object was last seen and the instances' `centers`, in the scene's frame."""
     here = np.stack([last_center(o) for o in objects])
-    there = np.stack([i.points.mean(axis=0) for i in instances])
-    return np.linalg.norm(here[:, None] - there[None], axis=-1)
+    return np.linalg.norm(here[:, None] - centers[None], axis=-1)
 
 
 def last_seen(o: SceneObject) -> tuple[Known, Pose]:
-    """All that was seen of an object, where it last stood, and the pose from there to its reference frame."""
-    T_ref_last = o.observations[-1].T_ref_scan
-    T_last_ref = np.linalg.inv(T_ref_last)
-    turn = jaxlie.SE3.from_rotation(jaxlie.SO3.from_matrix(jnp.asarray(T_last_ref[:3, :3], jnp.float32)))
-    moved = move_embedding(o.embedding, turn)  # about its origin, which moves along in float64
-    origin = apply_pose(T_last_ref, np.asarray(o.embedding.origin)[None])[0]
-    embedding = jax.tree.map(np.asarray, replace(moved, origin=origin))
-    return Known(points=apply_pose(T_last_ref, o.points), embedding=embedding), T_ref_last
+    """All that was seen of an object, where it last stood in the scene, and the pose from there to its own frame."""
+    T_scene_ref = place_of(o.observations[-1])
+    return moved(Known(points=o.points, embedding=o.embedding), T_scene_ref), np.linalg.inv(T_scene_ref)
 
 
 def target_of(o: SceneObject, config: SceneConfig) -> tuple[Known, Pose]:
@@ -114,7 +115,9 @@ def target_of(o: SceneObject, config: SceneConfig) -> tuple[Known, Pose]:
     reference = observation_in(o, o.reference_scan)
     if reference is None:
         raise ValueError(f"{o.id} has no observation in its reference scan {o.reference_scan}; needed one")
-    return Known(points=points_of(o, reference), embedding=o.embedding), np.eye(4)
+    T_scene_ref = reference.frame.T_scene_scan
+    known = Known(points=points_of(o, reference), embedding=o.embedding)
+    return moved(known, T_scene_ref), np.linalg.inv(T_scene_ref)
 
 
 def register_scan(
@@ -125,19 +128,26 @@ def register_scan(
     found: Sequence[Found],
     scan: int,
     config: SceneConfig,
+    frame: Frame = SCENE_FRAME,
 ) -> list[Observation]:
-    """Registers all that was found in one call: an observation each."""
+    """Registers all that was found in one call: an observation each. `frame`: of the scan and its embeddings."""
     if not found:
         return []
+    here = [
+        moved(
+            Known(points=instances[f.instance].points, embedding=embeddings[f.instance]), frame.T_scene_scan
+        )
+        for f in found
+    ]
     known, frames = zip(*(target_of(objects[f.object], config) for f in found), strict=True)
-    source = padded([instances[f.instance].points for f in found])
+    source = padded([k.points for k in here])
     target = padded([k.points for k in known])
-    source_code = with_origin(stack([embeddings[f.instance] for f in found])[0], np.asarray(source.origin))
+    source_code = with_origin(stack([k.embedding for k in here])[0], np.asarray(source.origin))
     target_code = with_origin(stack([k.embedding for k in known])[0], np.asarray(target.origin))
     result = register(prior, source, target, source_code, target_code, config.registration, config.upright)
     result = jax.device_get(result)
     return [
-        _observation(result, n, source, target, frames[n], f, scan, instances[f.instance].id)
+        _observation(result, n, source, target, frames[n], f, scan, instances[f.instance].id, frame)
         for n, f in enumerate(found)
     ]
 
@@ -151,6 +161,7 @@ def _observation(
     found: Found,
     scan: int,
     instance: int,
+    frame: Frame,
 ) -> Observation:
     """Pair `n` of a registration, in the scans' own frames."""
     T = jax.tree.map(lambda x: x[n], result.T_target_source)
@@ -162,11 +173,12 @@ def _observation(
     return Observation(
         scan=scan,
         instance=instance,
-        T_ref_scan=T_ref_target @ pose,
+        T_ref_scan=T_ref_target @ pose @ frame.T_scene_scan,
         score=found.score,
         rms_m=float(result.rms_m[n]),
         converged=bool(result.converged[n]),
         interchangeable=found.interchangeable,
         sigma_m=float(sigma_m),
         sigma_deg=float(np.rad2deg(sigma_rad)),
+        frame=frame,
     )

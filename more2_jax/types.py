@@ -149,6 +149,15 @@ class Scan:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Frame:
+    """How a scan's frame lies in the scene's, which is that of the first scan."""
+
+    T_scene_scan: Float[np.ndarray, "4 4"] = field(default_factory=lambda: np.eye(4))  # float64, row-major
+    sigma_m: float = 0.0  # standard errors of what it makes of a place and of a direction; 0 where it was
+    sigma_deg: float = 0.0  # taken as given
+
+
+@dataclass(frozen=True, kw_only=True)
 class Observation:
     """One object in one scan. `T_ref_scan` maps the scan's points onto the object's reference observation."""
 
@@ -161,6 +170,7 @@ class Observation:
     interchangeable: bool = False  # another assignment explains the scans as well: one of identical copies
     sigma_m: float = 0.0  # standard error of the position of its points' mean, and
     sigma_deg: float = 0.0  # of its rotation, as registration has it; 0 where it has none
+    frame: Frame = field(default_factory=Frame)  # of its scan
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -203,6 +213,7 @@ class ScanRecord:
     source: str
     instances: tuple[int, ...]
     skipped: tuple[Skipped, ...] = ()
+    frame: Frame = field(default_factory=Frame, compare=False)
     background: Float[np.ndarray, "b 3"] = field(  # thinned, to look at; metres, in the scan's frame, float64
         default_factory=lambda: np.zeros((0, 3)), compare=False, repr=False
     )

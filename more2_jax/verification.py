@@ -12,15 +12,17 @@ from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
+import jaxlie
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.optimize import linear_sum_assignment
+from scipy.spatial.transform import Rotation
 from scipy.special import expit
 
 from more2_jax.batching import bucket
 from more2_jax.config import SceneConfig
 from more2_jax.encoding import at_zero, padded, stack, with_origin
-from more2_jax.evidence import Compared, log_odds, pair_evidence
+from more2_jax.evidence import HYPOTHESES, Compared, log_odds, pair_evidence
 from more2_jax.types import Embedding
 
 Points = Float[np.ndarray, "_ 3"]
@@ -28,6 +30,8 @@ LogOdds = Float[np.ndarray, "n m"]
 
 SMALLEST = 16  # pairs of a compiled call
 TOP = 0.99  # share of a cloud's points below its top
+FARTHEST_M = 10.0  # what moved farther is no less likely for it
+LEAST_GAIN = 0.05  # share of its log odds that motion leaves a pair
 AS_GOOD = 1.0  # of log odds: an exchange that loses less is as good
 NEVER = -np.inf  # log odds of a pair that is no candidate
 
@@ -40,10 +44,21 @@ class Known:
     embedding: Embedding
 
 
-def pair_log_odds(old: Sequence[Known], new: Sequence[Known], config: SceneConfig) -> LogOdds:
-    """Of every object to be every instance; `NEVER` where the embeddings and sizes propose better partners."""
+@dataclass(frozen=True, kw_only=True)
+class PairFits:
+    """How every object fits every instance."""
+
+    odds: LogOdds  # of being one; `NEVER` where the embeddings and sizes propose better partners
+    T_old_new: Float[np.ndarray, "n m h 4 4"]  # poses that fit, best first, float64; NaN where never tried
+
+
+def fit_pairs(old: Sequence[Known], new: Sequence[Known], config: SceneConfig) -> PairFits:
+    """Aligns the likeliest pairs; all of `old` and `new` in one frame, or in two that differ by any motion.
+
+    Upright, the frames have one height (see `frames.common_height`).
+    """
     known = compared(old, new)
-    proposal = known.likeness - config.matching.size_weight * known.size
+    proposal = proposal_of(known, config)
     candidates = proposed(proposal, config.matching.candidates)
     rows = np.argwhere(candidates)
     count = bucket(len(rows), SMALLEST)
@@ -66,9 +81,37 @@ def pair_log_odds(old: Sequence[Known], new: Sequence[Known], config: SceneConfi
     )
     evidence = jax.tree.map(lambda x: np.asarray(x)[: len(rows)], jax.device_get(found))
     result = np.full(proposal.shape, NEVER)
+    poses = np.full((*proposal.shape, HYPOTHESES, 4, 4), np.nan)
+    poses[candidates] = in_frames(
+        evidence.poses, np.asarray(target.origin)[rows[:, 0]], np.asarray(source.origin)[rows[:, 1]]
+    )
     of_candidates = Compared(**{k: v[candidates] for k, v in vars(known).items()})
     result[candidates] = log_odds(evidence, of_candidates, config.upright)
-    return result
+    return PairFits(odds=result, T_old_new=poses)
+
+
+def in_frames(
+    local: jaxlie.SE3, target_origin: Float[np.ndarray, "p 3"], source_origin: Float[np.ndarray, "p 3"]
+) -> Float[np.ndarray, "p h 4 4"]:
+    """Poses between local frames as poses between the frames of the clouds, float64."""
+    q = np.asarray(local.rotation().wxyz, np.float64)
+    T = np.tile(np.eye(4), (*q.shape[:2], 1, 1))
+    R = Rotation.from_quat(q.reshape(-1, 4), scalar_first=True).as_matrix().reshape(*q.shape[:2], 3, 3)
+    shift = np.asarray(local.translation(), np.float64)
+    T[..., :3, :3] = R
+    T[..., :3, 3] = shift + target_origin[:, None] - np.einsum("phij,pj->phi", R, source_origin)
+    return T
+
+
+def proposal_of(known: Compared, config: SceneConfig) -> LogOdds:
+    """By what the embeddings propose pairs: likeness, less a difference in size."""
+    return known.likeness - config.matching.size_weight * known.size
+
+
+def heights(side: Sequence[Known]) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
+    """Heights of every cloud's lowest and highest points, metres."""
+    low, high = np.array([np.quantile(k.points[:, 2], (1 - TOP, TOP)) for k in side]).T
+    return low, high
 
 
 def compared(old: Sequence[Known], new: Sequence[Known]) -> Compared:
@@ -76,7 +119,7 @@ def compared(old: Sequence[Known], new: Sequence[Known]) -> Compared:
     a, b = (np.array([float(k.embedding.scale) for k in side]) for side in (old, new))
     x, y = (np.stack([np.asarray(k.embedding.inv, np.float64) for k in side]) for side in (old, new))
     x, y = (v / np.maximum(np.linalg.norm(v, axis=1, keepdims=True), 1e-30) for v in (x, y))
-    top, other = (np.array([np.quantile(k.points[:, 2], TOP) for k in side]) for side in (old, new))
+    (_, top), (_, other) = heights(old), heights(new)
     return Compared(size=np.abs(np.log(a[:, None] / b)), likeness=x @ y.T, top_m=np.abs(top[:, None] - other))
 
 
@@ -95,7 +138,8 @@ def assign(odds: LogOdds, moved_m: Float[np.ndarray, "n m"], weight: float) -> I
     A metre moved takes `weight` off the log odds of pairs that are possible: it decides among identical copies.
     """
     possible = odds > 0
-    gain = np.where(possible, np.maximum(odds - weight * moved_m, 1e-6), 0.0)
+    nearer = odds - weight * np.minimum(moved_m, FARTHEST_M)
+    gain = np.where(possible, np.maximum(nearer, LEAST_GAIN * odds), 0.0)
     rows = np.stack(linear_sum_assignment(-gain), axis=1)
     return rows[possible[tuple(rows.T)]]
 

@@ -18,6 +18,7 @@ from factories import living_scene, scene_object
 import more2_jax
 from more2_jax.config import preset
 from more2_jax.io import check_output, load_scene, save_scene, stored_at
+from more2_jax.types import Frame
 
 CONFIG = preset("robust", upright=True)
 
@@ -46,6 +47,28 @@ def test_round_trip_is_exact(tmp_path):
     assert config == CONFIG
     assert again.objects[0].points.dtype == np.float64
     assert again.objects[0].embedding.inv.dtype == np.float32
+
+
+def test_the_frame_of_a_scan_is_that_of_its_observations(tmp_path):
+    scene = living_scene()
+    frame = Frame(T_scene_scan=scene.objects[0].observations[-1].T_ref_scan, sigma_m=0.01, sigma_deg=0.2)
+    scans = (*scene.scans[:2], dataclasses.replace(scene.scans[2], frame=frame))
+    objects = tuple(
+        dataclasses.replace(
+            o, observations=tuple(dataclasses.replace(s, frame=scans[s.scan].frame) for s in o.observations)
+        )
+        for o in scene.objects
+    )
+    scene = dataclasses.replace(scene, scans=scans, objects=objects)
+    save_scene(scene, tmp_path / "scene", CONFIG)
+    again, _ = load_scene(tmp_path / "scene")
+    assert_same(scene, again)
+    content = json.loads((tmp_path / "scene/scene.json").read_text())
+    for s in content["scans"]:
+        del s["frame"]  # as written before frames were
+    (tmp_path / "scene/scene.json").write_text(json.dumps(content))
+    old, _ = load_scene(tmp_path / "scene")
+    assert_same(old.scans[2].frame, Frame())
 
 
 def test_folder_satisfies_the_schema(tmp_path):

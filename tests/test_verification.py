@@ -10,8 +10,8 @@ from more2_jax.verification import (
     NEVER,
     Known,
     assign,
+    fit_pairs,
     interchangeable,
-    pair_log_odds,
     proposed,
     unmatched,
 )
@@ -76,6 +76,6 @@ def test_geometry_tells_boxes_of_one_size_but_different_shape_apart(tiny_prior):
         [Known(points=p, embedding=e) for p, e in zip(clouds, embed(tiny_prior, clouds), strict=True)]
         for clouds in (first, second)
     ]
-    odds = pair_log_odds(known[0], known[1], preset("robust", upright=True))
+    odds = fit_pairs(known[0], known[1], preset("robust", upright=True)).odds
     assert odds.shape == (2, 2)
     assert min(odds[0, 1], odds[1, 0]) > max(odds[0, 0], odds[1, 1]) + 1

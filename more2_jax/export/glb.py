@@ -63,7 +63,7 @@ def _shape(o: SceneObject, number: int, node: Track) -> trimesh.PointCloud | tri
 
 def _channels(node: Track, T_middle_scan: Float[np.ndarray, "4 4"]) -> Channels:
     """What the node does at every scan."""
-    poses = T_middle_scan @ node.T_scan_node
+    poses = T_middle_scan @ node.T_scene_node
     return {
         "translation": (poses[:, :3, 3], "LINEAR"),
         "rotation": (quaternions(poses), "LINEAR"),

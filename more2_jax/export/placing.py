@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
-from more2_jax.objects import observation_in
+from more2_jax.objects import observation_in, place_of
 from more2_jax.types import LivingScene, SceneObject
 
 
@@ -33,11 +33,12 @@ class Track:
     """An object as a node that moves: geometry about its own centre, and a pose for every scan.
 
     Files hold geometry in single precision; about its own centre it keeps its micrometres however far from
-    the world's zero it lies. Where the object is absent its pose is the last one seen, or the first.
+    the world's zero it lies. Poses are in the scene's frame, which its scans may not share. Where the object
+    is absent its pose is the last one seen, or the first.
     """
 
     vertices: Float[np.ndarray, "v 3"]  # metres, relative to the node
-    T_scan_node: Float[np.ndarray, "scans 4 4"]
+    T_scene_node: Float[np.ndarray, "scans 4 4"]
     present: Bool[np.ndarray, " scans"]
 
 
@@ -46,12 +47,13 @@ def track(o: SceneObject, scans: int) -> Track:
     vertices = o.points if o.mesh is None else o.mesh.vertices
     T_ref_node = np.eye(4)
     T_ref_node[:3, 3] = vertices.mean(axis=0)
-    poses = [pose_in(o, s) for s in range(scans)]
+    seen = [observation_in(o, s) for s in range(scans)]
+    poses = [None if s is None else place_of(s) for s in seen]
     held = next(T for T in poses if T is not None)
     filled = [held := held if T is None else T for T in poses]
     return Track(
         vertices=vertices - T_ref_node[:3, 3],
-        T_scan_node=np.stack([T @ T_ref_node for T in filled]),
+        T_scene_node=np.stack([T @ T_ref_node for T in filled]),
         present=np.array([T is not None for T in poses]),
     )
 

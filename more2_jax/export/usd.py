@@ -33,7 +33,7 @@ def write_usd(scene: LivingScene, path: Path, scan: int) -> None:
     stage.SetDefaultPrim(root.GetPrim())
     for k, o in enumerate(scene.objects):
         node = track(o, len(scene.scans))
-        _add_node(pxr, stage, o, node.T_scan_node, node.present)
+        _add_node(pxr, stage, o, node.T_scene_node, node.present)
         _add_shape(pxr, stage, o, node.vertices, rgb(k))
     stage.GetRootLayer().Save()
 

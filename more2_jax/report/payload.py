@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from more2_jax.config import SceneConfig
 from more2_jax.metrics import apply_pose
-from more2_jax.objects import points_of
+from more2_jax.objects import place_of
 from more2_jax.report.blob import Blob
 from more2_jax.report.coverage import coverage
 from more2_jax.report.palette import color, ink
@@ -49,9 +49,13 @@ def payload(scene: LivingScene, config: SceneConfig) -> tuple[dict[str, Any], st
     kilometres away from the frame's zero. Lengths are metres, rotations quaternions (x, y, z, w).
     """
     blob = Blob()
-    clouds = [points_of(o, seen) for o in scene.objects for seen in o.observations]
+    clouds = [
+        apply_pose(place_of(seen), o.points[o.point_scan == seen.scan])
+        for o in scene.objects
+        for seen in o.observations
+    ]
     objects = np.concatenate(clouds)
-    everything = np.concatenate([objects, *(s.background for s in scene.scans)])
+    everything = np.concatenate([objects, *(_background(s) for s in scene.scans)])
     low, high = everything.min(axis=0), everything.max(axis=0)
     middle = (low + high) / 2
     points = share_of(len(everything), MOST_POINTS)
@@ -88,8 +92,13 @@ def _pair(scene: LivingScene, verdicts: list[Verdict], a: int, b: int) -> dict[s
 
 def _scan(s: ScanRecord, blob: Blob, share: float, middle: Point) -> dict[str, Any]:
     has = len(s.background) > 0
-    background = blob.add_points(thinned(s.background - middle, share)) if has else None
+    background = blob.add_points(thinned(_background(s) - middle, share)) if has else None
     return {"name": s.name, "background": background}
+
+
+def _background(s: ScanRecord) -> Float[np.ndarray, "b 3"]:
+    """What is no object, in the scene's frame."""
+    return apply_pose(s.frame.T_scene_scan, s.background)
 
 
 def _object(
@@ -126,14 +135,14 @@ def _mesh(mesh: Mesh, blob: Blob, anchor: Point, most: int) -> dict[str, Any]:
 
 
 def _observation(o: SceneObject, seen: Observation, anchor: Point, middle: Point) -> dict[str, Any]:
-    """Where the object lies in one scan, and how sure that is."""
-    T_scan_ref = np.linalg.inv(seen.T_ref_scan)
+    """Where the object lies in one scan, in the scene's frame, and how sure that is."""
+    T_scene_ref = place_of(seen)
     mine = o.point_scan == seen.scan
     reference = seen.scan == o.reference_scan
     return {
         "scan": seen.scan,
-        "position": (apply_pose(T_scan_ref, anchor[None])[0] - middle).tolist(),
-        "quaternion": Rotation.from_matrix(T_scan_ref[:3, :3]).as_quat().tolist(),
+        "position": (apply_pose(T_scene_ref, anchor[None])[0] - middle).tolist(),
+        "quaternion": Rotation.from_matrix(T_scene_ref[:3, :3]).as_quat().tolist(),
         "score": None if reference else seen.score,
         "rms_mm": None if reference else 1000 * seen.rms_m,
         "doubts": doubts_of(o, seen),
