@@ -17,6 +17,16 @@ import numpy as np
 from jaxtyping import Float
 
 from more2_jax.config import SceneConfig
+from more2_jax.consensus import (
+    FEWEST,
+    ROOM_WORSE,
+    Votes,
+    estimate,
+    most_agreed,
+    position_sigma,
+    room_misfit,
+    with_errors,
+)
 from more2_jax.metrics import apply_pose
 from more2_jax.types import Embedding, Frame, move_embedding
 from more2_jax.verification import Known, PairFits, assign, compared, fit_pairs, heights, proposal_of
@@ -29,6 +39,11 @@ AS_GOOD_VOTES = 0.8  # share of the most votes at which heights that agree are n
 CLEARLY = 3.0  # of log odds over a scene: what a change of height must explain beyond none at all
 LAYER_M = 0.02  # thickness of the layers among which a floor is sought
 FLOOR_SHARE = 0.3  # of the fullest layer: the lowest that holds as much is the floor
+GIVEN_M, MUCH_LESS = (
+    0.01,
+    0.5,
+)  # a frame as given is off by more, and explains what stayed at most half as well,
+SURE = 2.0  # and by more standard errors, where another takes its place
 LEAST_M = 0.005  # a smaller lift is none
 
 
@@ -66,9 +81,45 @@ def common_frame(
 ) -> tuple[Frame, PairFits]:
     """The frame of a new scan, and how its instances (`new`, own frame) then fit the objects (`old`, scene's)."""
     height, fits = common_height(old, new, config, rooms) if config.upright else (0.0, None)
-    if fits is None:
-        fits = fit_pairs(old, new, config)
-    return Frame(T_scene_scan=lift(height)), fits
+    fits = fits or fit_pairs(old, new, config)
+    lifted = lift(height)
+    pairs = np.argwhere(fits.odds > 0)
+    votes = Votes(
+        T_scene_scan=fits.T_old_new[tuple(pairs.T)] @ lifted,
+        center=np.stack([k.points.mean(axis=0) for k in new])[pairs[:, 1]],
+        object=pairs[:, 0],
+        instance=pairs[:, 1],
+    )
+    T = most_agreed(votes, config.upright, lifted)
+    misfit, before = (room_misfit(x, rooms.scene, rooms.scan) for x in (T, lifted))
+    return Frame(T_scene_scan=T if misfit <= ROOM_WORSE * before else lifted), fits
+
+
+def settled_frame(
+    frame: Frame, places: Sequence[Pose], centers: Points, sigma_m: Sequence[float], upright: bool
+) -> Frame:
+    """The frame by least squares over registered pairs: those that agree with it stayed, as far as is known.
+
+    `places`: T_scene_scan as if the object had not moved, `centers`: mean points (scan's frame), `sigma_m`: errors,
+    one a pair. A frame that was given is kept unless another is clearly better.
+    """
+    every = np.arange(len(places))
+    votes = Votes(T_scene_scan=np.stack(places)[:, None], center=centers, object=every, instance=every)
+    given = with_errors(frame.T_scene_scan, votes, upright)
+    found = estimate(frame.T_scene_scan, votes, upright, np.asarray(sigma_m))
+    here, there = (apply_pose(x.T_scene_scan, centers) for x in (given, found))
+    apart = float(np.sqrt(np.mean(np.sum((here - there) ** 2, axis=1))))
+    as_given = np.array_equal(frame.T_scene_scan, np.eye(4))
+    least = max(GIVEN_M, SURE * position_sigma(found, there)) if as_given else 0.0
+    better = found.cost < (MUCH_LESS * given.cost if as_given else given.cost)
+    best = found if found.agreeing >= FEWEST and better and apart > least else given
+    if best.agreeing < FEWEST:
+        return frame
+    return Frame(
+        T_scene_scan=best.T_scene_scan,
+        sigma_m=position_sigma(best, apply_pose(best.T_scene_scan, centers)),
+        sigma_deg=float(np.rad2deg(np.sqrt(np.trace(best.covariance[3:, 3:])))),
+    )
 
 
 # --- the height ---------------------------------------------------------------------------------------------

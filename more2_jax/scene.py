@@ -16,7 +16,7 @@ from more2_jax.metrics import apply_pose
 from more2_jax.objects import SCENE_FRAME, changes_between, new_object, seen_again
 from more2_jax.prior import Prior
 from more2_jax.progress import Watcher, staged
-from more2_jax.tracking import match_scan, register_scan
+from more2_jax.tracking import match_scan, register_in_frame
 from more2_jax.types import Frame, Instance, LivingScene, Mesh, Scan, ScanRecord, SceneObject, Skipped
 
 BACKGROUND_POINTS = 20_000  # of a scan, remembered for the page
@@ -60,10 +60,9 @@ def add_scan(
         embeddings = embed(prior, [i.points for i in instances])
     with stage("match", len(instances)):
         identified = match_scan(objects, instances, embeddings, config, rooms_of(scene, scan))
-    frame = identified.frame
     found, chance = identified.found, {objects[k].id: p for k, p in identified.gone.items()}
     with stage("register", len(found), unit="pairs"):
-        seen = register_scan(prior, objects, instances, embeddings, found, index, config, frame)
+        seen, frame = register_in_frame(prior, objects, instances, embeddings, identified, index, config)
     for f, observation in zip(found, seen, strict=True):
         objects[f.object] = seen_again(objects[f.object], instances[f.instance], observation)
         if config.matching.verify:

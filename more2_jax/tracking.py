@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import jax
 import numpy as np
@@ -12,7 +12,7 @@ from scipy.special import expit
 
 from more2_jax.config import SceneConfig
 from more2_jax.encoding import padded, stack, with_origin
-from more2_jax.frames import Rooms, common_frame, moved
+from more2_jax.frames import Rooms, common_frame, moved, settled_frame
 from more2_jax.matching import match_instances
 from more2_jax.metrics import apply_pose
 from more2_jax.objects import SCENE_FRAME, Pose, last_center, observation_in, place_of, points_of
@@ -150,6 +150,33 @@ def register_scan(
         _observation(result, n, source, target, frames[n], f, scan, instances[f.instance].id, frame)
         for n, f in enumerate(found)
     ]
+
+
+def register_in_frame(
+    prior: Prior,
+    objects: Sequence[SceneObject],
+    instances: Sequence[Instance],
+    embeddings: Sequence[Embedding],
+    identified: Identified,
+    scan: int,
+    config: SceneConfig,
+) -> tuple[list[Observation], Frame]:
+    """Registers all that was found, and settles the frame of the scan by what stayed in it.
+
+    If that changes the frame, all is registered again: "it did not move" is another pose then.
+    """
+    found, frame = identified.found, identified.frame
+    seen = register_scan(prior, objects, instances, embeddings, found, scan, config, frame)
+    if not config.matching.verify or not seen:
+        return seen, frame
+    places = [
+        place_of(objects[f.object].observations[-1]) @ s.T_ref_scan for f, s in zip(found, seen, strict=True)
+    ]
+    centers = np.stack([instances[f.instance].points.mean(axis=0) for f in found])
+    settled = settled_frame(frame, places, centers, [s.sigma_m for s in seen], config.upright)
+    if not np.array_equal(settled.T_scene_scan, frame.T_scene_scan):
+        seen = register_scan(prior, objects, instances, embeddings, found, scan, config, settled)
+    return [replace(s, frame=settled) for s in seen], settled
 
 
 def _observation(

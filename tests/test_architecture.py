@@ -38,7 +38,7 @@ LAYERS = {
         "meshing",
         "joint",
     ),
-    "scene": ("objects", "encoding", "verification", "frames", "tracking", "fitting", "scene"),
+    "scene": ("objects", "encoding", "verification", "consensus", "frames", "tracking", "fitting", "scene"),
     "programs": ("io", "report", "export", "demo", "commands", "cli", "train", "eval"),
 }
 HEIGHT = {name: height for height, names in enumerate(LAYERS.values()) for name in names}

@@ -6,7 +6,8 @@ import dataclasses
 
 import numpy as np
 import pytest
-from test_scene import CONFIG, scan
+from factories import turn_z
+from test_scene import CONFIG, piece, scan
 
 from more2_jax.encoding import embed
 from more2_jax.frames import (
@@ -20,8 +21,9 @@ from more2_jax.frames import (
     moved_embedding,
 )
 from more2_jax.metrics import apply_pose
+from more2_jax.objects import motion_between
 from more2_jax.scene import add_scan, start_scene
-from more2_jax.types import LivingScene, Scan
+from more2_jax.types import Instance, LivingScene, Scan
 from more2_jax.verification import Known
 
 FIRST = {0: (0.0, 0.0), 1: (0.3, 3.0), 2: (0.0, 6.0)}
@@ -65,11 +67,45 @@ def same_but_for(T_own_scene: np.ndarray, scene: LivingScene, together: LivingSc
     np.testing.assert_allclose(scene.scans[1].frame.T_scene_scan @ T_own_scene, np.eye(4), atol=atol)
 
 
-@pytest.mark.parametrize("height_m", [1.0, -0.4, 0.05])
+@pytest.mark.parametrize("height_m", [1.0, *(pytest.param(h, marks=pytest.mark.slow) for h in (-0.4, 0.05))])
 def test_a_lifted_scan_is_matched_as_if_it_were_not(tiny_prior, together, height_m):
     assert together.changes[0].moved == ("object_001",)
     T = lift(height_m)
     same_but_for(T, visited(tiny_prior, in_frame(scan("b", THEN), T)), together, atol=5e-3)
+
+
+def furnished(name: str, moved_m: float) -> Scan:
+    """Five pieces of different sizes, of which the last stands elsewhere by `moved_m`."""
+    clouds = [piece(k) for k in range(3)]
+    clouds += [piece(0) * [1.5, 0.8, 1.6], piece(1) * [0.6, 1.7, 1.5]]
+    places = [(0, 0, 0), (4, 1, 0), (1, 5, 0), (4, 4, 0), (-3 + moved_m, 3, 0)]
+    instances = [
+        Instance(id=k, points=c - [0, 0, c[:, 2].min()] + p)
+        for k, (c, p) in enumerate(zip(clouds, places, strict=True))
+    ]
+    return Scan(name=name, source=name, instances=tuple(instances))
+
+
+@pytest.mark.parametrize(
+    ("turn_deg", "shift"),
+    [(137.0, (7.0, -30.0, 1.3)), pytest.param(1.5, (0.04, 0.03, 0.0), marks=pytest.mark.slow)],
+)
+def test_a_scan_in_another_frame_shows_what_moved_in_the_scenes(tiny_prior, turn_deg, shift):
+    first, second = furnished("a", 0.0), furnished("b", 1.0)
+    T = turn_z(np.deg2rad(turn_deg), np.zeros(3), np.array(shift))
+    made = add_scan(tiny_prior, start_scene(tiny_prior, first, CONFIG), in_frame(second, T), CONFIG)
+    frame = made.scans[1].frame
+    np.testing.assert_allclose(frame.T_scene_scan @ T, np.eye(4), atol=0.02)
+    assert 0 < frame.sigma_m < 0.03
+    ids = [o.id for o in made.objects]
+    assert (made.changes[0].static, made.changes[0].moved) == (tuple(ids[:4]), (ids[4],))
+    last = made.objects[4]
+    distance_m, angle_deg = motion_between(last, *last.observations)
+    assert distance_m == pytest.approx(1.0, abs=0.03)
+    assert angle_deg < 1.5
+    for o in made.objects[:4]:
+        np.testing.assert_allclose(o.observations[1].T_ref_scan @ T, np.eye(4), atol=0.02)
+        assert all(s.frame is made.scans[s.scan].frame or s.scan == 0 for s in o.observations)
 
 
 def test_scans_of_one_frame_keep_it_to_the_last_bit(together):
