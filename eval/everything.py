@@ -19,7 +19,7 @@ from train.program import run
 
 Program = Literal["matching", "registration", "reconstruction", "end_to_end", "accumulation", "ablations"]
 PROGRAMS: dict[Program, tuple[Any, type[Options]]] = {
-    "matching": (matching.main, Options),
+    "matching": (matching.main, matching.Settings),
     "registration": (registration.main, registration.Settings),
     "reconstruction": (reconstruction.main, reconstruction.Settings),
     "end_to_end": (end_to_end.main, end_to_end.Settings),
@@ -54,6 +54,8 @@ class Settings:
     """End to end also through these masks."""
     samples: int = 20_000
     """Points on each surface."""
+    classifier: Path | None = None
+    """Weights of eval.peers.classifier, to be matched with too."""
     peers: bool = True
     """Also measure what one would use instead; only once, beside the first preset."""
     fresh: bool = False
@@ -100,6 +102,7 @@ def one(s: Settings, data: Path, preset: str, program: Program, extra: dict[str,
         "peers": s.peers and preset == s.presets[0],
         "fresh": s.fresh,
         "samples": s.samples,
+        "classifier": s.classifier,
         **extra,
     }
     main(kind(**{k: v for k, v in given.items() if k in known}))

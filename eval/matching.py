@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Annotated
 
 import numpy as np
@@ -19,6 +20,7 @@ from eval.batched import embed_all
 from eval.figures import COLUMNS, Figure, Record, in_columns
 from eval.match_scores import match_scores, partners
 from eval.options import Options, benchmark, is_upright
+from eval.peers import classifier
 from eval.peers.matching import Matcher, matchers
 from eval.results import finish
 from eval.runs import run_scenes, start_run
@@ -56,11 +58,21 @@ FIGURES = [
 ]
 
 
-def main(options: Annotated[Options, tyro.conf.arg(name="")]) -> None:
+@dataclass(frozen=True, kw_only=True)
+class Settings(Options):
+    """Which data, which settings, and where results go."""
+
+    classifier: Path | None = None
+    """Weights of `eval.peers.classifier`, to be matched with too."""
+
+
+def main(options: Annotated[Settings, tyro.conf.arg(name="")]) -> None:
     """Instance and scene recall of the method, of its parts, and of what one would use instead."""
     methods = own_settings(options.preset)
     upright = is_upright(options, benchmark(options))
     peers = matchers(upright) if options.peers else {}
+    if options.classifier is not None:
+        peers |= {classifier.NAME: classifier.classifier(options.classifier, options.batch)}
     current = start_run("matching", options, {"methods": [*methods, *peers]})
     settings = {n: replace(preset(options.preset, upright=upright), matching=m) for n, m in methods.items()}
     records = run_scenes(

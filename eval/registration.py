@@ -29,6 +29,8 @@ from more2_jax.config import RegistrationConfig, preset
 from more2_jax.prior import Prior
 from train.program import run
 
+KABSCH = "Kabsch on F_eqv alone"  # a learned peer, as FreeReg: one look at the codes
+
 
 @dataclass(frozen=True, kw_only=True)
 class Settings(Options):
@@ -105,11 +107,13 @@ def main(options: Annotated[Settings, tyro.conf.arg(name="")]) -> None:
 def own_settings(name: str, upright: bool) -> dict[str, RegistrationConfig]:
     """The preset's registration, with and without what follows the coarse search of starts."""
     config = preset(name, upright=upright).registration
+    paper = preset("paper", upright=upright).registration
     return {
         f"ours, {name}": config,
         f"ours, {name}, without optimisation": dataclasses.replace(
             config, steps=0, surface_steps=0, polish_steps=0
         ),
+        KABSCH: dataclasses.replace(paper, steps=0, icp_steps=0),
     }
 
 

@@ -24,6 +24,7 @@ TITLES = {
     "reconstruction": "Reconstruction",
     "accumulation": "Accumulation",
     "ablations": "Ablations",
+    "decoding": "Decoding",
 }
 MAIN_FIGURE = {  # of each program, the one shown by category
     "end_to_end": "MR, strict",

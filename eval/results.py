@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import importlib.metadata
+import sys
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
@@ -44,12 +45,22 @@ def finish(
 def provenance(run: Run, o: Options) -> dict[str, Any]:
     """Command, data, settings, hardware, versions: what a figure belongs to."""
     return {
+        **circumstances_now(),
         "command": portable(words_of(o, run.settings["program"])),
+        "scenes_asked": o.scenes or len(run.data.names),
+        "settings": run.settings,
+    }
+
+
+def circumstances_now() -> dict[str, Any]:
+    """Command as given, date, hardware, versions."""
+    main = Path(sys.argv[0])
+    name = f"{main.parent.name}.{main.stem}"
+    return {
+        "command": portable(["python", "-m", name, *sys.argv[1:]]),
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
         "hardware": hardware(),
         "versions": {p: _version(p) for p in ("jax", "open3d-cpu", "small-gicp", "kiss-matcher")},
-        "scenes_asked": o.scenes or len(run.data.names),
-        "settings": run.settings,
     }
 
 

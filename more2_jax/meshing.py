@@ -109,7 +109,7 @@ def _in_chunks(
     chunk = CHUNK.get(jax.default_backend(), CHUNK_OF_OTHERS)
     padded = np.zeros((-(-max(len(points), 1) // chunk) * chunk, 3), np.float32)
     padded[: len(points)] = points
-    parts = [of(prior, local, part) for part in padded.reshape(-1, chunk, 3)]
+    parts = [of(prior, local, jnp.asarray(part)) for part in padded.reshape(-1, chunk, 3)]
     return np.concatenate(jax.device_get(parts))[: len(points)]
 
 

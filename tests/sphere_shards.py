@@ -20,6 +20,9 @@ def sphere_shards(folder: Path) -> Path:
     shard.mkdir()
     for name, array in arrays.items():
         np.save(shard / f"{name}.npy", array.astype(np.float16))
-    meta = [{"name": f"sphere_{k}", "split": "val" if k % 5 == 0 else "train"} for k in range(40)]
+    meta = [
+        {"name": f"sphere_{k}", "category": f"ball {k % 2}", "split": "val" if k % 5 == 0 else "train"}
+        for k in range(40)
+    ]
     (shard / "meta.json").write_text(json.dumps(meta))
     return folder
