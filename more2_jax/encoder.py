@@ -7,6 +7,7 @@ from typing import Any
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 from jaxtyping import Bool, Float
 
@@ -25,6 +26,7 @@ from more2_jax.vn import (
     masked_mean,
     nearest_features,
     norm,
+    paired,
     vn_leaky_relu,
 )
 
@@ -34,6 +36,12 @@ Features = Float[Array, "n 3 c"]
 def divide_by_count(total: Features, real: Bool[Array, "n k"]) -> Features:
     """The mean over the real neighbours, from the sum over them."""
     return total / jnp.maximum(real.sum(axis=-1), 1)[:, None, None]
+
+
+def channels_of(vectors: tuple[Array, Array, Array], kernel: Float[Array, "3 c"]) -> Features:
+    """The vectors (n, 3) side by side, times the kernel: a sum, as three channels make too narrow a product."""
+    a, b, c = (vector[..., None] * row for vector, row in zip(vectors, kernel, strict=True))
+    return a + b + c
 
 
 def power_of_two(x: Float[Array, ""]) -> Float[Array, ""]:
@@ -56,16 +64,18 @@ class FirstBlock(nn.Module):
         c = self.config
         index, real = nearest_features(points[..., None], points[..., None], mask, c.neighbours)
         length = jnp.sqrt(jnp.maximum(jnp.sum(points**2, axis=-1), TINY))
-        weights = VNLAWeights(3, c.widths[0], name="value")()
+        kernel, direction = VNLAWeights(3, c.widths[0], name="value")()
 
-        def edge(neighbour: Array, own: tuple[Array, Array], shared: tuple[Array, Array], real: Array) -> Any:
+        def edge(neighbour: Array, own: tuple[Array, Array], maps: tuple[Array, Array], real: Array) -> Any:
             unit, point = own
-            graph = jnp.stack([jnp.cross(unit, neighbour), neighbour - point, point], axis=-1)
-            q = graph @ shared[0]
-            return real[:, None, None] * vn_leaky_relu(q, q @ shared[1], c.leak), ()
+            graph = jnp.cross(unit, neighbour), neighbour - point, point
+            q, k = (channels_of(graph, w) for w in maps)
+            return vn_leaky_relu(q, k, c.leak, real[:, None, None]), ()
 
+        # The direction is folded into the kernel: no product of matrices an edge.
+        maps = (kernel, kernel @ direction)
         own, counted = (points / length[:, None], points), real.T.astype(points.dtype)
-        return divide_by_count(over_neighbours(edge, points, own, weights, counted, index)[0], real)
+        return divide_by_count(over_neighbours(edge, points, own, maps, counted, index)[0], real)
 
 
 class LinearBlock(nn.Module):
@@ -84,7 +94,7 @@ class LinearBlock(nn.Module):
         counted = real.T.astype(query.dtype)
 
         def edge(neighbour: EdgeParts, own: EdgeParts, _: tuple[()], real: Array) -> Any:
-            return real[:, None, None] * edge_vnla(neighbour, own, c.leak), ()
+            return edge_vnla(neighbour, own, c.leak, real[:, None, None]), ()
 
         return divide_by_count(over_neighbours(edge, of_neighbour, of_self, (), counted, index)[0], real)
 
@@ -108,28 +118,30 @@ class AttentionBlock(nn.Module):
         asked = channel_normalise(VNLA(self.features, c.leak, name="query")(query))
         key, own_key = EdgeVNLA(self.features, name="key")(source, query)
         value, own_value = EdgeVNLA(self.features, name="value")(source, query)
+        heads = membership(self.features, c.head_channels)
 
         def score(neighbour: EdgeParts, own: tuple[Array, EdgeParts], _: tuple[()], __: tuple[()]) -> Any:
             asked, parts = own
-            product = asked * channel_normalise(edge_vnla(neighbour, parts, c.leak))
-            return (), by_head(product, c.head_channels).sum(axis=(-3, -1))
+            found = edge_vnla(neighbour, parts, c.leak)
+            along = jnp.matmul(paired(asked, found), heads, precision="highest")
+            return (), (along, paired(found, found).sum(axis=-1, keepdims=True))
 
-        _, logit = over_neighbours(score, key, (asked, own_key), (), (), index)
-        logit = logit / jnp.sqrt(3.0 * c.head_channels)
+        _, (along, squared) = over_neighbours(score, key, (asked, own_key), (), (), index)
+        logit = along * jax.lax.rsqrt(3.0 * c.head_channels * jnp.where(squared > TINY, squared, 1.0))
         weight = jax.nn.softmax(logit, axis=0, where=real.T[..., None])
 
         def weighted(neighbour: EdgeParts, own: EdgeParts, _: tuple[()], weight: Array) -> Any:
-            by_channel = jnp.repeat(weight, c.head_channels, axis=-1)
-            return by_channel[:, None, :] * edge_vnla(neighbour, own, c.leak), ()
+            by_channel = jnp.matmul(weight, heads.T, precision="highest")
+            return edge_vnla(neighbour, own, c.leak, by_channel[:, None]), ()
 
         mixed, _ = over_neighbours(weighted, value, own_value, (), weight, index)
         context = jnp.broadcast_to(masked_mean(mixed, query_mask), mixed.shape)
         return VNLA(self.features, c.leak, name="context")(jnp.concatenate([mixed, context], axis=-1))
 
 
-def by_head(x: Float[Array, "*b 3 c"], channels: int) -> Float[Array, "*b 3 heads channels"]:
-    """Splits the channels into heads."""
-    return x.reshape(*x.shape[:-1], -1, channels)
+def membership(features: int, channels: int) -> Float[np.ndarray, "features heads"]:
+    """1 where a channel is of a head: a product with it sums by heads, one with its transpose repeats."""
+    return np.repeat(np.eye(features // channels, dtype=np.float32), channels, axis=0)
 
 
 class Center(nn.Module):

@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float, Int
 
 SPARE = 8  # more candidates than neighbours asked for, before exact distances decide
 TINY = 1e-30  # guards squared norms: far below any feature, so it changes none (1e-12 would)
+FAR = 1e30  # squared distance to a row that is not there: larger than any, yet finite
 NO_DIRECTION = 1e-19  # squared; its inverse square, in the gradient of a division, is still a float32
 
 EdgeParts = tuple[Float[Array, "_ 3 o"], Float[Array, "_ 3 o"]]  # linear part, and its direction
@@ -42,41 +43,83 @@ def dot(a: Float[Array, "*b 3 c"], b: Float[Array, "*b 3 d"]) -> Float[Array, "*
     return (x + y + z)[..., None, :]
 
 
+@jax.custom_vjp
+def paired(a: Float[Array, "*b 3 c"], b: Float[Array, "*b 3 c"]) -> Float[Array, "*b c"]:
+    """`dot`, to be differentiated: what differentiation makes of its slices takes five times as long on CPUs."""
+    return dot(a, b)[..., 0, :]
+
+
+def _paired_forward(a: Array, b: Array) -> tuple[Array, tuple[Array, Array]]:
+    return dot(a, b)[..., 0, :], (a, b)
+
+
+def _paired_backward(kept: tuple[Array, Array], g: Array) -> tuple[Array, Array]:
+    a, b = kept
+    return g[..., None, :] * b, g[..., None, :] * a
+
+
+paired.defvjp(_paired_forward, _paired_backward)
+
+
 def vn_leaky_relu(
-    q: Float[Array, "*b 3 c"], k: Float[Array, "*b 3 d"], leak: float
+    q: Float[Array, "*b 3 c"],
+    k: Float[Array, "*b 3 d"],
+    leak: float,
+    weight: Float[Array, "*b 1 w"] | None = None,
 ) -> Float[Array, "*b 3 c"]:
-    """Where ⟨q, k⟩ < 0, takes (1 − leak) of the part of q along k away. `d` is c, or 1 to share a direction."""
-    result: Array = _leaky(q, k, leak)  # pyright: ignore[reportAssignmentType]
+    """Where ⟨q, k⟩ < 0, takes (1 − leak) of the part of q along k away; then times `weight`.
+
+    `d` is c, or 1 to share a direction; `w` is c, or 1.
+    """
+    result: Array = _leaky(q, k, weight, leak)  # pyright: ignore[reportAssignmentType]
     return result
 
 
-@partial(jax.custom_vjp, nondiff_argnums=(2,))
-def _leaky(q: Array, k: Array, leak: float) -> Array:
-    length = dot(k, k)
+@partial(jax.custom_vjp, nondiff_argnums=(3,))
+def _leaky(q: Array, k: Array, weight: Array | None, leak: float) -> Array:
+    length, along = dot(k, k), dot(q, k)
     # A zero direction removes nothing; dividing by 1 there keeps the gradient finite.
-    share = jnp.minimum(dot(q, k), 0.0) / jnp.where(length > NO_DIRECTION, length, 1.0)
-    return q - (1.0 - leak) * share * k
+    share = jnp.minimum(along, 0.0) / jnp.where(length > NO_DIRECTION, length, 1.0)
+    return times(weight, q - (1.0 - leak) * share * k)
 
 
-def inverse(squared: Float[Array, "*b"]) -> Float[Array, "*b"]:
-    """1 / x; 0 where x is too small for the gradient to stay finite."""
-    return jnp.where(squared > NO_DIRECTION, 1.0 / jnp.where(squared > NO_DIRECTION, squared, 1.0), 0.0)
+def times(weight: Array | None, x: Array) -> Array:
+    """`x`, weighted if there is a weight."""
+    return x if weight is None else weight * x
 
 
-def _leaky_forward(q: Array, k: Array, leak: float) -> tuple[Array, tuple[Array, Array]]:
-    return vn_leaky_relu(q, k, leak), (q, k)
+def _leaky_forward(
+    q: Array, k: Array, weight: Array | None, leak: float
+) -> tuple[Array, tuple[Array, Array, Array | None]]:
+    return _leaky(q, k, weight, leak), (q, k, weight)  # pyright: ignore[reportReturnType]
 
 
-def _leaky_backward(leak: float, kept: tuple[Array, Array], g: Array) -> tuple[Array, Array]:
-    """By hand: what differentiation makes of the three slices in `dot` takes five times as long on CPUs."""
-    q, k = kept
-    along, unit = dot(q, k), inverse(dot(k, k))
-    removed = jnp.where(along < 0, (1.0 - leak) * unit, 0.0)
-    of_share = removed * dot(g, k)
-    of_k = 2.0 * of_share * along * unit * k - removed * along * g - of_share * q
+def _leaky_backward(
+    leak: float, kept: tuple[Array, Array, Array | None], g: Array
+) -> tuple[Array, Array, Array | None]:
+    """By hand: what differentiation makes of the three slices in `dot` takes five times as long on CPUs.
+
+    Every factor ends in its division: XLA never computes a quotient twice, so each is stored, at a third of the
+    size of q, instead of being found anew for every component of every result.
+    """
+    q, k, weight = kept
+    along, squared = dot(q, k), dot(k, k)
+    safe = jnp.where(squared > NO_DIRECTION, squared, 1.0)
+    removed = jnp.where(
+        (along < 0) & (squared > NO_DIRECTION), times(weight, jnp.full_like(along, 1.0 - leak)), 0.0
+    )
+    of_share, of_g = removed * dot(g, k) / safe, removed * along / safe
+    of_direction = 2.0 * of_share * along / safe
+    of_k = of_direction * k - of_g * g - of_share * q
     if k.shape[-1] != q.shape[-1]:
         of_k = of_k.sum(axis=-1, keepdims=True)
-    return g - of_share * k, of_k
+    of_q = times(weight, g) - of_share * k
+    if weight is None:
+        return of_q, of_k, None
+    of_weight = dot(g, _leaky(q, k, None, leak))
+    if weight.shape[-1] != of_weight.shape[-1]:
+        of_weight = of_weight.sum(axis=-1, keepdims=True)
+    return of_q, of_k, of_weight
 
 
 _leaky.defvjp(_leaky_forward, _leaky_backward)
@@ -133,9 +176,11 @@ class EdgeVNLA(nn.Module):
         return (of_neighbour, of_neighbour @ direction), (of_self, of_self @ direction)
 
 
-def edge_vnla(of_neighbour: EdgeParts, of_self: EdgeParts, leak: float) -> Float[Array, "n 3 o"]:
-    """VNLA of one edge a query, from its two parts."""
-    return vn_leaky_relu(of_neighbour[0] + of_self[0], of_neighbour[1] + of_self[1], leak)
+def edge_vnla(
+    of_neighbour: EdgeParts, of_self: EdgeParts, leak: float, weight: Float[Array, "n 1 w"] | None = None
+) -> Float[Array, "n 3 o"]:
+    """VNLA of one edge a query, from its two parts, times `weight`."""
+    return vn_leaky_relu(of_neighbour[0] + of_self[0], of_neighbour[1] + of_self[1], leak, weight)
 
 
 def nearest_features(
@@ -146,14 +191,16 @@ def nearest_features(
 ) -> tuple[Int[Array, "n k"], Bool[Array, "n k"]]:
     """Indices of the `k` nearest sources in feature space, itself included, and which of them are real."""
     a, b = jax.lax.stop_gradient((query.reshape(len(query), -1), source.reshape(len(source), -1)))
-    product = jnp.matmul(a, b.T, precision="highest")
-    # |a|² is the same for a whole row, so it does not change the order.
-    distance = jnp.where(source_mask, jnp.sum(b * b, axis=-1) - 2 * product, jnp.inf)
-    rough, candidate = jax.lax.top_k(-distance, min(k + SPARE, len(b)))
+    # 2⟨a, b⟩ − |b|² as one product: |a|² is the same for a whole row, and a matrix of n m numbers is written once.
+    squared = jnp.where(source_mask, jnp.sum(b * b, axis=-1), FAR)
+    ones = jnp.ones((len(a), 1), a.dtype)
+    rows, columns = jnp.concatenate([2 * a, -ones], axis=-1), jnp.concatenate([b, squared[:, None]], axis=-1)
+    closeness = jnp.matmul(rows, columns.T, precision="highest")
+    _, candidate = jax.lax.top_k(closeness, min(k + SPARE, len(b)))
     # The expansion cancels, and a swapped k-th neighbour moves the code by percents: the last word has the
     # sum of squared differences.
     exact = jnp.sum((a[:, None] - b[candidate]) ** 2, axis=-1)
-    nearest, rank = jax.lax.top_k(jnp.where(jnp.isfinite(rough), -exact, -jnp.inf), k)
+    nearest, rank = jax.lax.top_k(jnp.where(source_mask[candidate], -exact, -jnp.inf), k)
     return jnp.take_along_axis(candidate, rank, axis=1), jnp.isfinite(nearest)
 
 
