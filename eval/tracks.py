@@ -14,6 +14,7 @@ from eval.mesh_scores import RECONSTRUCTED, mesh_scores
 from eval.pose_scores import failed_pose, pose_scores
 from eval.truth import KnownObject, KnownScene, Pose
 from more2_jax.metrics import f1
+from more2_jax.objects import accumulated_points
 from more2_jax.types import LivingScene, Mesh
 
 
@@ -33,7 +34,7 @@ def tracks_of(scene: LivingScene) -> list[Track]:
         Track(
             instance={seen.scan: seen.instance for seen in o.observations},
             T_track_scan={seen.scan: seen.T_ref_scan for seen in o.observations},
-            points=o.points,
+            points=accumulated_points(o),
             mesh=o.mesh,
         )
         for o in scene.objects

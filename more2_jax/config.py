@@ -147,6 +147,7 @@ class SceneConfig:
     accumulate_target: bool = (
         False  # match and register against all seen so far, not the reference observation
     )
+    accumulate_misfit: float = 1.0  # an observation whose registration fits worse is left out of the shape
     matching: MatchingConfig = field(default_factory=MatchingConfig)
     registration: RegistrationConfig = field(default_factory=RegistrationConfig)
     joint: JointConfig = field(default_factory=JointConfig)
@@ -210,6 +211,7 @@ def preset(name: str, *, upright: bool = False) -> SceneConfig:
             preset="robust",
             upright=upright,
             accumulate_target=True,
+            accumulate_misfit=0.5,
             matching=MatchingConfig(score="inv", size_weight=0.5, motion_weight=0.2, verify=True),
             registration=RegistrationConfig(
                 points=256,

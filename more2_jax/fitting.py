@@ -14,7 +14,7 @@ from more2_jax.batching import bucket
 from more2_jax.config import SceneConfig
 from more2_jax.encoding import SMALLEST_BATCH, at_zero, embed, padded, stack, unstack, with_origin
 from more2_jax.joint import Observations, fit_jointly
-from more2_jax.objects import Pose, apply_pose, points_of
+from more2_jax.objects import Pose, accumulated, accumulated_points, apply_pose, points_of
 from more2_jax.prior import Prior, encode
 from more2_jax.registration import world_pose
 from more2_jax.types import SceneObject
@@ -26,7 +26,9 @@ def embed_accumulated(
     """Encodes the accumulated clouds of the `chosen` objects; the others stay as they are."""
     result = list(objects)
     if chosen:
-        for k, embedding in zip(chosen, embed(prior, [objects[k].points for k in chosen]), strict=True):
+        for k, embedding in zip(
+            chosen, embed(prior, [accumulated_points(objects[k]) for k in chosen]), strict=True
+        ):
             result[k] = dataclasses.replace(objects[k], embedding=embedding)
     return result
 
@@ -44,7 +46,7 @@ def fit_objects(
     for n, k in enumerate(chosen):
         local = [
             jax.tree.map(lambda x, n=n, j=j: x[n, j], fit.T_ref_obs)
-            for j in range(len(objects[k].observations))
+            for j in range(len(accumulated(objects[k])))
         ]
         poses = [world_pose(T, origins[n, 0], origins[n, j]) for j, T in enumerate(local)]
         embedding = dataclasses.replace(embeddings[n], origin=origins[n, 0])
@@ -55,19 +57,19 @@ def fit_objects(
 def gather(
     prior: Prior, objects: Sequence[SceneObject], config: SceneConfig
 ) -> tuple[Observations, np.ndarray]:
-    """Every observation of every object as one batch (objects, observations, …), and their float64 origins."""
-    most = bucket(max(len(o.observations) for o in objects), 2)
+    """Every accumulated observation as one batch (objects, observations, …), and their float64 origins."""
+    most = bucket(max(len(accumulated(o)) for o in objects), 2)
     count = bucket(len(objects), SMALLEST_BATCH)
-    rows = [[points_of(o, seen) for seen in o.observations] for o in objects]
+    rows = [[points_of(o, seen) for seen in accumulated(o)] for o in objects]
     flat = [cloud for row in rows for cloud in [*row, *[row[0]] * (most - len(row))]]
     cloud = padded(flat, smallest=SMALLEST_BATCH * most)
     codes = encode(prior, cloud)
     origins = np.asarray(cloud.origin).reshape(-1, most, 3)[:count]
-    accumulated, _ = stack([o.embedding for o in objects])
+    together, _ = stack([o.embedding for o in objects])
     real, poses = np.zeros((count, most), bool), np.tile([1.0, 0, 0, 0, 0, 0, 0], (count, most, 1))
     real[:, 0] = True
     for n, o in enumerate(objects):
-        for j, seen in enumerate(o.observations):
+        for j, seen in enumerate(accumulated(o)):
             real[n, j], poses[n, j] = True, local_pose(seen.T_ref_scan, origins[n, 0], origins[n, j])
     split = lambda x: jnp.asarray(x).reshape(-1, most, *x.shape[1:])[:count]  # noqa: E731
     return Observations(
@@ -76,7 +78,7 @@ def gather(
         real=jnp.asarray(real),
         codes=jax.tree.map(split, at_zero(codes)),
         T_ref_obs=jaxlie.SE3(jnp.asarray(poses, jnp.float32)),
-        accumulated=at_zero(with_origin(accumulated, origins[:, 0])),
+        accumulated=at_zero(with_origin(together, origins[:, 0])),
     ), origins
 
 
@@ -88,10 +90,12 @@ def local_pose(T_ref_scan: Pose, ref_origin: np.ndarray, scan_origin: np.ndarray
 
 
 def repose(o: SceneObject, poses: Sequence[Pose]) -> SceneObject:
-    """The object with other poses; its accumulated cloud follows."""
-    points = o.points.copy()
+    """The object with other poses of its accumulated observations, one each; its cloud follows."""
+    points, posed = o.points.copy(), iter(poses)
     observations = []
-    for seen, T in zip(o.observations, poses, strict=True):
-        points[o.point_scan == seen.scan] = apply_pose(T, points_of(o, seen))
+    for seen in o.observations:
+        T = next(posed) if seen.accumulated else seen.T_ref_scan
+        if seen.accumulated:
+            points[o.point_scan == seen.scan] = apply_pose(T, points_of(o, seen))
         observations.append(dataclasses.replace(seen, T_ref_scan=T))
     return dataclasses.replace(o, points=points, observations=tuple(observations))

@@ -235,6 +235,8 @@ def _object_to_json(o: SceneObject) -> dict[str, Any]:
                 "interchangeable": bool(seen.interchangeable),
                 "sigma_m": float(seen.sigma_m),
                 "sigma_deg": float(seen.sigma_deg),
+                "misfit": float(seen.misfit),
+                "accumulated": bool(seen.accumulated),
             }
             for seen in o.observations
         ],

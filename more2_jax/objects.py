@@ -47,14 +47,26 @@ def new_object(
 
 
 def seen_again(o: SceneObject, instance: Instance, seen: Observation) -> SceneObject:
-    """The object with one more observation, accumulated in its reference frame; its mesh is out of date."""
+    """The object with one more observation; its mesh is out of date if that is accumulated."""
     return dataclasses.replace(
         o,
         observations=(*o.observations, seen),
         points=np.concatenate([o.points, apply_pose(seen.T_ref_scan, instance.points)]),
         point_scan=np.concatenate([o.point_scan, np.full(len(instance.points), seen.scan)]),
-        mesh=None,
+        mesh=None if seen.accumulated else o.mesh,
     )
+
+
+def accumulated(o: SceneObject) -> list[Observation]:
+    """The observations that make up the object's shape; the reference is one of them."""
+    return [seen for seen in o.observations if seen.accumulated]
+
+
+def accumulated_points(o: SceneObject) -> Points:
+    """The points of those observations, in the object's reference frame."""
+    if all(seen.accumulated for seen in o.observations):
+        return o.points
+    return o.points[np.isin(o.point_scan, [seen.scan for seen in accumulated(o)])]
 
 
 def points_of(o: SceneObject, seen: Observation) -> Points:
@@ -69,7 +81,7 @@ def observation_in(o: SceneObject, scan: int) -> Observation | None:
 
 def last_center(o: SceneObject) -> Float[np.ndarray, "3"]:
     """Where the object was when last seen: its accumulated cloud's mean, in the scene's frame."""
-    return apply_pose(place_of(o.observations[-1]), o.points.mean(axis=0, keepdims=True))[0]
+    return apply_pose(place_of(o.observations[-1]), accumulated_points(o).mean(axis=0, keepdims=True))[0]
 
 
 def place_of(seen: Observation) -> Pose:
@@ -80,7 +92,7 @@ def place_of(seen: Observation) -> Pose:
 def motion_between(o: SceneObject, before: Observation, after: Observation) -> tuple[float, float]:
     """How far (metres, at the object's mean) and by what angle (degrees) it moved, in the scene's frame."""
     first, then = place_of(before), place_of(after)
-    center = o.points.mean(axis=0, keepdims=True)
+    center = accumulated_points(o).mean(axis=0, keepdims=True)
     distance = float(np.linalg.norm(apply_pose(then, center) - apply_pose(first, center)))
     return distance, float(rotation_error_deg(then[:3, :3], first[:3, :3]))
 

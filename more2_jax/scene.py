@@ -13,7 +13,14 @@ from more2_jax.fitting import embed_accumulated, fit_objects
 from more2_jax.frames import Rooms
 from more2_jax.meshing import extract_mesh, observed_level
 from more2_jax.metrics import apply_pose
-from more2_jax.objects import SCENE_FRAME, changes_between, new_object, seen_again
+from more2_jax.objects import (
+    SCENE_FRAME,
+    accumulated,
+    accumulated_points,
+    changes_between,
+    new_object,
+    seen_again,
+)
 from more2_jax.prior import Prior
 from more2_jax.progress import Watcher, staged
 from more2_jax.tracking import match_scan, register_in_frame
@@ -69,7 +76,8 @@ def add_scan(
             chance[objects[f.object].id] = f.score  # that what came back is what it was
     if config.accumulate_target:
         with stage("encode", len(found)):
-            objects = embed_accumulated(prior, objects, [f.object for f in found])
+            changed = [f.object for f, s in zip(found, seen, strict=True) if s.accumulated]
+            objects = embed_accumulated(prior, objects, changed)
     known = {f.instance for f in found}
     for i in (i for i in range(len(instances)) if i not in known):
         objects.append(new_object(len(objects), index, instances[i], embeddings[i], frame))
@@ -88,11 +96,13 @@ def reconstruct(
 ) -> LivingScene:
     """Optimises code and poses of every object seen more than once, all in one call, then extracts meshes.
 
+    Observations in doubt (`Observation.accumulated` False) have no part in it.
+
     Objects that have a mesh have not changed since and are left alone.
     """
     timing, objects = dict(scene.timing_s), list(scene.objects)
     todo = [k for k, o in enumerate(objects) if o.mesh is None]
-    again = [k for k in todo if len(objects[k].observations) > 1]
+    again = [k for k in todo if len(accumulated(objects[k])) > 1]
     with staged(timing, progress, "joint", len(again)):
         objects = fit_objects(prior, objects, again, config)
     with staged(timing, progress, "mesh", len(todo)) as advance:
@@ -110,14 +120,15 @@ def mesh_of(prior: Prior, o: SceneObject, config: SceneConfig) -> Mesh | None:
 
     `level` "observed": seen points lie on the surface, so the field's median there is its bias, and is taken off.
     """
-    level = observed_level(prior, o.embedding, o.points) if config.meshing.level == "observed" else 0.0
-    return extract_mesh(prior, o.embedding, config.meshing, box_half_width(o, config), level, o.points)
+    points = accumulated_points(o)
+    level = observed_level(prior, o.embedding, points) if config.meshing.level == "observed" else 0.0
+    return extract_mesh(prior, o.embedding, config.meshing, box_half_width(o, config), level, points)
 
 
 def box_half_width(o: SceneObject, config: SceneConfig) -> float:
     """Half the edge of the box to mesh, canonical units: at least the usual, and all of what was seen."""
     center = np.asarray(o.embedding.center, np.float64) + o.embedding.origin
-    seen = np.quantile(np.abs(o.points - center).max(axis=1), 0.99) / float(o.embedding.scale)
+    seen = np.quantile(np.abs(accumulated_points(o) - center).max(axis=1), 0.99) / float(o.embedding.scale)
     return float(np.clip(1.15 * seen, config.meshing.half_width, 3 * config.meshing.half_width))
 
 

@@ -15,7 +15,15 @@ from more2_jax.encoding import padded, stack, with_origin
 from more2_jax.frames import Rooms, common_frame, moved, settled_frame
 from more2_jax.matching import match_instances
 from more2_jax.metrics import apply_pose
-from more2_jax.objects import SCENE_FRAME, Pose, last_center, observation_in, place_of, points_of
+from more2_jax.objects import (
+    SCENE_FRAME,
+    Pose,
+    accumulated_points,
+    last_center,
+    observation_in,
+    place_of,
+    points_of,
+)
 from more2_jax.prior import Prior
 from more2_jax.registration import register, world_pose
 from more2_jax.types import (
@@ -103,9 +111,10 @@ def distances(objects: Sequence[SceneObject], centers: Float[np.ndarray, "m 3"])
 
 
 def last_seen(o: SceneObject) -> tuple[Known, Pose]:
-    """All that was seen of an object, where it last stood in the scene, and the pose from there to its own frame."""
+    """All accumulated of an object, where it last stood in the scene, and the pose from there to its own frame."""
     T_scene_ref = place_of(o.observations[-1])
-    return moved(Known(points=o.points, embedding=o.embedding), T_scene_ref), np.linalg.inv(T_scene_ref)
+    known = Known(points=accumulated_points(o), embedding=o.embedding)
+    return moved(known, T_scene_ref), np.linalg.inv(T_scene_ref)
 
 
 def target_of(o: SceneObject, config: SceneConfig) -> tuple[Known, Pose]:
@@ -176,7 +185,9 @@ def register_in_frame(
     settled = settled_frame(frame, places, centers, [s.sigma_m for s in seen], config.upright)
     if not np.array_equal(settled.T_scene_scan, frame.T_scene_scan):
         seen = register_scan(prior, objects, instances, embeddings, found, scan, config, settled)
-    return [replace(s, frame=settled) for s in seen], settled
+    return [
+        replace(s, frame=settled, accumulated=s.misfit <= config.accumulate_misfit) for s in seen
+    ], settled
 
 
 def _observation(
@@ -208,4 +219,5 @@ def _observation(
         sigma_m=float(sigma_m),
         sigma_deg=float(np.rad2deg(sigma_rad)),
         frame=frame,
+        misfit=0.0 if result.misfit is None else float(result.misfit[n]),
     )

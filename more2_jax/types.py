@@ -171,6 +171,8 @@ class Observation:
     sigma_m: float = 0.0  # standard error of the position of its points' mean, and
     sigma_deg: float = 0.0  # of its rotation, as registration has it; 0 where it has none
     frame: Frame = field(default_factory=Frame)  # of its scan
+    misfit: float = 0.0  # of registration: 0 none, 1 nothing of both clouds agrees; 0 where it has none
+    accumulated: bool = True  # its points are part of the object's shape; False where the pose is in doubt
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -179,6 +181,7 @@ class SceneObject:
 
     `points` are accumulated in the frame of the reference observation; `point_scan` names the scan each
     came from, so every single observation can be had back: `inverse(T_ref_scan) @ points[point_scan == s]`.
+    Code and mesh are of the accumulated observations alone (`objects.accumulated_points`).
     """
 
     id: str

@@ -19,9 +19,7 @@ EYE = np.eye(4)
 
 
 def pose(rng, upright=True, far=20.0):
-    turn = (
-        Rotation.from_euler("z", rng.uniform(-np.pi, np.pi)) if upright else Rotation.random(None, rng)
-    )
+    turn = Rotation.from_euler("z", rng.uniform(-np.pi, np.pi)) if upright else Rotation.random(None, rng)
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = turn.as_matrix(), rng.uniform(-far, far, 3)
     return T

@@ -150,6 +150,8 @@ SCHEMA = exactly(
                     interchangeable={"type": "boolean"},
                     sigma_m={"type": "number", "minimum": 0},
                     sigma_deg={"type": "number", "minimum": 0},
+                    misfit={"type": "number", "minimum": 0, "maximum": 1},
+                    accumulated={"type": "boolean"},
                 ),
             },
         ),

@@ -29,11 +29,11 @@ def write_glb(scene: LivingScene, path: Path, scan: int) -> None:
     """Objects as nodes under `ROOT`; at rest as in `scan`, in the animation `scans` as in scan t at t seconds.
 
     An object that is absent has scale 0, in steps: glTF has no other visibility that every viewer knows.
-    Positions are relative to the scene's middle, which `ROOT` holds in double precision.
+    Positions are in the scene's frame, relative to the scene's middle, which `ROOT` holds in double precision.
     """
-    middle = np.mean(
-        [T_scan_ref @ [*o.points.mean(axis=0), 1.0] for _, o, T_scan_ref in placed(scene, scan)], 0
-    )
+    T_scene_scan = scene.scans[scan].frame.T_scene_scan
+    shown = [T @ [*o.points.mean(axis=0), 1.0] for _, o, T in placed(scene, scan)]
+    middle = T_scene_scan @ np.mean(shown, axis=0)
     T_middle_scan = trimesh.transformations.translation_matrix(-middle[:3])
     graph = trimesh.Scene()
     graph.graph.update(

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
-from more2_jax.objects import observation_in, place_of
+from more2_jax.objects import accumulated_points, observation_in, place_of
 from more2_jax.types import LivingScene, SceneObject
 
 
@@ -44,7 +44,7 @@ class Track:
 
 def track(o: SceneObject, scans: int) -> Track:
     """The node of one object over all scans: its mesh, or its accumulated points without one."""
-    vertices = o.points if o.mesh is None else o.mesh.vertices
+    vertices = accumulated_points(o) if o.mesh is None else o.mesh.vertices
     T_ref_node = np.eye(4)
     T_ref_node[:3, 3] = vertices.mean(axis=0)
     seen = [observation_in(o, s) for s in range(scans)]

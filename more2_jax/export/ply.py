@@ -9,12 +9,13 @@ import numpy as np
 from more2_jax.export.placing import placed
 from more2_jax.meshfile import write_points
 from more2_jax.metrics import apply_pose
+from more2_jax.objects import accumulated_points
 from more2_jax.types import LivingScene
 
 
 def write_ply(scene: LivingScene, path: Path, scan: int) -> None:
     """Points in the frame of `scan`, metres, z up; the vertex property `object` is the object's number."""
     there = placed(scene, scan)
-    points = np.concatenate([apply_pose(T_scan_ref, o.points) for _, o, T_scan_ref in there])
-    numbers = np.repeat([k for k, _, _ in there], [len(o.points) for _, o, _ in there])
+    clouds = [apply_pose(T_scan_ref, accumulated_points(o)) for _, o, T_scan_ref in there]
+    points, numbers = np.concatenate(clouds), np.repeat([k for k, _, _ in there], [len(c) for c in clouds])
     write_points(path, points, numbers, "object")

@@ -58,6 +58,8 @@ def doubts_of(o: SceneObject, seen: Observation) -> list[str]:
     doubts = [] if seen.converged else ["its new position did not settle"]
     if seen.score < LOW_SCORE:
         doubts.append(f"it may be another object: match score {seen.score:.2f}, below {LOW_SCORE:.2f}")
+    if not seen.accumulated:
+        doubts.append("what was seen of it does not fit well: left out of its shape")
     return doubts
 
 
