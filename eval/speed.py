@@ -28,6 +28,7 @@ from more2_jax.config import PriorConfig, TrainingRun, load_config
 from more2_jax.decoder import Decoder
 from more2_jax.geometry import farthest_points
 from more2_jax.prior import Prior, encode_ordered, init_prior
+from train.memory import GLIBC_KEEPS_MEMORY, keep_freed_memory
 from train.program import run
 
 WHAT = {"forward": "encoder forward", "encoder_step": "encoder and its gradient", "step": "training step"}
@@ -54,6 +55,7 @@ def main(
         queries: a cloud, in the training step: encoder, decoder, mean error, gradient, Adam. No dropout.
         repeats: rounds; every competitor once a round.
     """
+    keep_freed_memory()  # as training does
     quiet = published_layers(load_config(config, TrainingRun).model)
     batch = clouds_and_queries(clouds, points, queries)
     jobs = {
@@ -104,7 +106,8 @@ def distances(prior: Prior, points: Array, queries: Array, plain: bool) -> Array
         code = outputs(prior, points, plain)
         return plain_layers.decode(prior.params["decoder"], code, queries, prior.config)
     e = encode_ordered(prior, points, jnp.ones(len(points), bool))
-    return Decoder(prior.config).apply({"params": prior.params["decoder"]}, e, queries)  # type: ignore[return-value]
+    decoder = Decoder(prior.config)
+    return decoder.apply({"params": prior.params["decoder"]}, e, queries, train=True)  # type: ignore[return-value]
 
 
 def jax_jobs(model: PriorConfig, batch: tuple[Array, Array, Array], plain: bool) -> dict[str, Job]:
@@ -150,7 +153,10 @@ def torch_jobs(
         return
     script = str(Path(__file__).with_name("torch_layers.py"))
     pipe = subprocess.PIPE
-    with subprocess.Popen([interpreter, script], stdin=pipe, stdout=pipe, text=True) as worker:
+    environment = os.environ | GLIBC_KEEPS_MEMORY
+    with subprocess.Popen(
+        [interpreter, script], stdin=pipe, stdout=pipe, text=True, env=environment
+    ) as worker:
         names = ("hidden", "layers", "skip", "narrow")
         d = model.decoder
         settings = {

@@ -11,6 +11,7 @@ from jaxtyping import Float
 from more2_jax.config import PriorConfig
 from more2_jax.local_field import LocalField, LocalLookup, local_width
 from more2_jax.types import Embedding, pytree
+from more2_jax.vn import linear
 
 Affine = tuple[Float[Array, "4 h"], Float[Array, " h"]]
 
@@ -37,7 +38,7 @@ def product(h: Float[Array, "n i"], kernel: Float[Array, "i o"], train: bool) ->
     """
     if not train:
         return h @ kernel
-    return jax.lax.platform_dependent(h, kernel, cpu=jnp.matmul, default=bfloat16_product)
+    return jax.lax.platform_dependent(h, kernel, cpu=linear, default=bfloat16_product)
 
 
 def bfloat16_product(h: Float[Array, "n i"], kernel: Float[Array, "i o"]) -> Float[Array, "n o"]:

@@ -5,9 +5,14 @@ from __future__ import annotations
 import ctypes
 
 TRIM_THRESHOLD, TOP_PAD, MMAP_THRESHOLD = -1, -2, -3  # of mallopt, in glibc's malloc.h
-LIMIT = (
-    2**30
-)  # glibc takes no larger threshold for mapped blocks on all machines; beyond it a block is mapped
+LIMIT = 2**30  # glibc takes no larger threshold on all machines; a block beyond it is mapped
+OPTIONS = ((MMAP_THRESHOLD, LIMIT), (TRIM_THRESHOLD, 2**31 - 1), (TOP_PAD, 2**28))
+# The same for a process that is to be started.
+GLIBC_KEEPS_MEMORY = {
+    "MALLOC_MMAP_THRESHOLD_": str(LIMIT),
+    "MALLOC_TRIM_THRESHOLD_": str(2**31 - 1),
+    "MALLOC_TOP_PAD_": str(2**28),
+}
 
 
 def keep_freed_memory() -> bool:
@@ -19,5 +24,4 @@ def keep_freed_memory() -> bool:
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
     if mallopt is None:
         return False
-    options = ((MMAP_THRESHOLD, LIMIT), (TRIM_THRESHOLD, 2**31 - 1), (TOP_PAD, 2**28))
-    return all([mallopt(option, value) == 1 for option, value in options])
+    return all([mallopt(option, value) == 1 for option, value in OPTIONS])
