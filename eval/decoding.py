@@ -82,13 +82,8 @@ def main(
     """
     own, training = load_prior(prior), load_config(config, TrainingRun).training
     weights = trained(own, shards, training, steps, learning_rate, seed)
-    stated = {
-        "program": "decoding",
-        "prior": prior,
-        "weights": weights_digest(own),
-        "preset": "paper",
-        "masks": "true",
-    }
+    stated = {"program": "decoding", "prior": prior, "weights": weights_digest(own)}
+    stated |= {"preset": "paper", "masks": "true"}
     for number in views:
         records = scored(own, weights, shards, split, number, points, noise, most, seed)
         facts = {"dataset": f"shapes of split {split}", "regime": f"{number} views", "digest": "–"}
