@@ -114,7 +114,10 @@ def test_a_port_that_cannot_be_had_is_told(served):
 
 def show(*arguments) -> subprocess.Popen:
     environment = {k: v for k, v in os.environ.items() if k not in ("DISPLAY", "WAYLAND_DISPLAY")}
-    command = [sys.executable, "-m", "more2_jax.cli", "show", *map(str, arguments)]
+    # Whoever runs tests in the background lets them ignore interrupts; the program under test should hear them.
+    heard = "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler); "
+    start = "from more2_jax.cli import main; sys.exit(main())"
+    command = [sys.executable, "-c", heard + start, "show", *map(str, arguments)]
     return subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment
     )
