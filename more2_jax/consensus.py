@@ -120,14 +120,13 @@ def best_motion(
     w = np.repeat(weight / weight.sum(), len(arms)) / len(arms)
     a, b = a.reshape(-1, 3), b.reshape(-1, 3)
     mean_a, mean_b = w @ a, w @ b
-    H = (a - mean_a).T @ (w[:, None] * (b - mean_b))
     T = np.eye(4)
     if upright:
+        H = (a - mean_a).T @ (w[:, None] * (b - mean_b))
         angle = np.arctan2(H[0, 1] - H[1, 0], H[0, 0] + H[1, 1])
         T[:3, :3] = Rotation.from_euler("z", angle).as_matrix()
     else:
-        U, _, Vt = np.linalg.svd(H)
-        T[:3, :3] = Vt.T @ np.diag([1, 1, np.sign(np.linalg.det(Vt.T @ U.T))]) @ U.T
+        T[:3, :3] = Rotation.align_vectors(b - mean_b, a - mean_a, weights=w)[0].as_matrix()
     T[:3, 3] = mean_b - T[:3, :3] @ mean_a
     return T
 

@@ -38,12 +38,11 @@ SPREAD_M = 0.015  # of the votes for a height
 AS_GOOD_VOTES = 0.8  # share of the most votes at which heights that agree are not doubted
 CLEARLY = 3.0  # of log odds over a scene: what a change of height must explain beyond none at all
 LAYER_M = 0.02  # thickness of the layers among which a floor is sought
+STRAY = (0.002, 0.998)  # quantiles of height outside of which points are none of a room's
 FLOOR_SHARE = 0.3  # of the fullest layer: the lowest that holds as much is the floor
-GIVEN_M, MUCH_LESS = (
-    0.01,
-    0.5,
-)  # a frame as given is off by more, and explains what stayed at most half as well,
-SURE = 2.0  # and by more standard errors, where another takes its place
+GIVEN_M = 0.01  # by more than this a frame as given is off where another takes its place,
+MUCH_LESS = 0.5  # which leaves at most this share of what the given one leaves of the votes,
+SURE = 2.0  # and by more than this many standard errors
 LEAST_M = 0.005  # a smaller lift is none
 
 
@@ -203,7 +202,9 @@ def floor_height(background: Points) -> float | None:
     """Height of the lowest layer that holds a good part of the fullest one's points, metres; None without points."""
     if not len(background):
         return None
-    z = background[:, 2]
+    # A stray point a kilometre off must not make a million layers.
+    least, most = np.quantile(background[:, 2], STRAY)
+    z = background[(background[:, 2] >= least) & (background[:, 2] <= most), 2]
     count, edges = np.histogram(z, bins=max(1, int(np.ceil(np.ptp(z) / LAYER_M))))
     lowest = int(np.argmax(count >= FLOOR_SHARE * count.max()))
     inside = (z >= edges[lowest] - LAYER_M) & (z <= edges[lowest + 1] + LAYER_M)

@@ -158,3 +158,10 @@ def test_a_moved_embedding_is_that_of_the_moved_cloud(tiny_prior):
     np.testing.assert_allclose(found.eqv, after.eqv, atol=1e-3)
     np.testing.assert_allclose(found.center + found.origin, after.center + after.origin, atol=1e-3)
     assert moved(Known(points=points, embedding=before), np.eye(4)).points is points
+
+
+def test_a_stray_point_far_away_changes_no_floor():
+    rng = np.random.default_rng(0)
+    floor = np.column_stack([rng.uniform(-3, 3, (4000, 2)), 0.4 + 0.003 * rng.normal(size=4000)])
+    strays = np.array([[0.0, 0, -1e9], [0, 0, 1e9]])
+    assert floor_height(np.concatenate([floor, strays])) == pytest.approx(0.4, abs=0.01)
