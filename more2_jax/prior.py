@@ -50,8 +50,10 @@ def init_prior(config: PriorConfig, key: Array, name: str = "random") -> Prior:
 
 
 def _initialise(module: Encoder | Decoder, key: Array, *inputs: Any) -> tuple[dict[str, Any], Any]:
-    output, variables = jax.jit(module.init_with_output)(key, *inputs)
-    return dict(variables["params"]), output
+    """Weights, and zeros in the output's shapes: no weight depends on the inputs, so nothing is computed of them."""
+    output, _ = jax.eval_shape(module.init_with_output, key, *inputs)
+    variables = jax.jit(module.init)(key, *inputs)
+    return dict(variables["params"]), jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), output)
 
 
 def encode_ordered(prior: Prior, points: Float[Array, "n 3"], mask: Bool[Array, " n"]) -> Embedding:

@@ -6,7 +6,6 @@ from pathlib import Path
 import pytest
 
 from more2_jax.config import (
-    EncoderConfig,
     MatchingConfig,
     PriorConfig,
     SceneConfig,
@@ -49,7 +48,13 @@ def test_paper_is_the_paper():
 
 
 def test_base_has_the_published_widths():
-    assert load_config(ROOT / "configs" / "base.yaml", TrainingRun).model.encoder == EncoderConfig()
+    model, published = load_config(ROOT / "configs" / "base.yaml", TrainingRun).model, PriorConfig()
+    for part, names in {
+        "encoder": ("widths", "code", "neighbours", "linear_blocks", "head_channels", "downsample_blocks"),
+        "decoder": ("hidden", "layers", "skip_layer"),
+    }.items():
+        for name in names:
+            assert getattr(getattr(model, part), name) == getattr(getattr(published, part), name), name
 
 
 def test_yaw_starts_only_when_upright():
