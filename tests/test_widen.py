@@ -1,7 +1,7 @@
 """A widened prior is the narrow one until it trains, and everything new in it trains."""
 
 import dataclasses
-from functools import partial
+import functools
 from typing import Any
 
 import jax
@@ -29,6 +29,11 @@ NARROW = PriorConfig(
     eqv_gain=3.0,
     inv_gain=12.0,
 )  # fmt: skip
+
+
+@functools.cache
+def narrow_prior() -> Prior:
+    return init_prior(NARROW, jax.random.key(1))
 
 
 def changed(config: PriorConfig, encoder: dict | None = None, decoder: dict | None = None) -> PriorConfig:
@@ -72,16 +77,16 @@ def clouds(points: int, count: int = 3) -> tuple[jax.Array, jax.Array, jax.Array
 @jax.jit
 def outputs(prior: Prior, points: jax.Array, mask: jax.Array, queries: jax.Array) -> dict[str, jax.Array]:
     """Codes of clouds, their centre, and distances around it, in units of the size of clouds."""
-    codes = jax.vmap(partial(encode_ordered, prior))(points, mask)
+    codes = jax.vmap(functools.partial(encode_ordered, prior))(points, mask)
     # Random weights have any F_s: queries spread accordingly.
     asked = queries * codes.scale[:, None, None] + codes.center[:, None]
-    sdf = jax.vmap(partial(sdf_one, prior))(codes, asked)
+    sdf = jax.vmap(functools.partial(sdf_one, prior))(codes, asked)
     return {"inv": codes.inv, "eqv": codes.eqv, "scale": codes.scale, "center": codes.center, "sdf": sdf}
 
 
 @pytest.mark.parametrize("wider", WIDER)
 def test_codes_and_distances_stay(wider):
-    narrow = init_prior(NARROW, jax.random.key(1))
+    narrow = narrow_prior()
     wide = widen(narrow, WIDER[wider], jax.random.key(2))
     assert_same(outputs(narrow, *clouds(32)), outputs(wide, *clouds(32)))
 
@@ -106,7 +111,7 @@ def assert_same(narrow: dict[str, jax.Array], wide: dict[str, jax.Array]) -> Non
 
 def test_everything_new_is_reached_by_a_gradient():
     """At once, or after the one step that moves what leads from it off zero."""
-    before_widening = init_prior(NARROW, jax.random.key(1))
+    before_widening = narrow_prior()
     wide = widen(before_widening, WIDE, jax.random.key(2))
     points, mask, queries = clouds(32)
     rng = np.random.default_rng(1)
@@ -156,7 +161,7 @@ def test_new_layers_come_last_ahead_of_the_skip_and_last_of_all():
 )
 def test_what_cannot_be_widened_is_refused_in_one_line(wanted, message):
     with pytest.raises(ValueError, match=message) as refused:
-        widen(init_prior(NARROW, jax.random.key(0)), wanted, jax.random.key(0))
+        widen(narrow_prior(), wanted, jax.random.key(0))
     assert "\n" not in str(refused.value)
 
 
