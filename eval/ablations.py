@@ -22,7 +22,7 @@ from eval.matching import record as match_record
 from eval.mesh_scores import RECONSTRUCTED, mesh_scores
 from eval.options import Options
 from eval.pose_scores import pose_scores
-from eval.reconstruction import Seen, embedded, fitted_in_batches, seen_objects
+from eval.reconstruction import Seen, embedded, fitted_in_batches, mesh_seen, seen_objects
 from eval.registration import own_records, own_settings, true_pairs
 from eval.results import finish
 from eval.runs import run_scenes, start_run
@@ -30,7 +30,6 @@ from eval.truth import KnownScene
 from more2_jax.config import JointConfig, MatchingConfig, SceneConfig
 from more2_jax.fitting import repose
 from more2_jax.prior import Prior
-from more2_jax.scene import mesh_of
 from more2_jax.types import SceneObject
 from train.program import run
 
@@ -187,7 +186,7 @@ def joint_records(
     """One record of each object's mesh, and one of each of its poses."""
     found = []
     for s, own in zip(seen, objects, strict=True):
-        scores = mesh_scores(mesh_of(prior, own, config), s.known, s.known.T_scan_model[0], samples)
+        scores = mesh_scores(mesh_seen(prior, s, own, config), s.known, s.known.T_scan_model[0], samples)
         found.append((s.scene.name, {"method": method, "object": s.known.name, **scores}))
         target = s.scene.instance(0, s.known.instance[0]).points
         for o in own.observations[1:]:

@@ -30,7 +30,7 @@ from more2_jax.config import SceneConfig
 from more2_jax.fitting import fit_objects
 from more2_jax.metrics import apply_pose
 from more2_jax.prior import Prior
-from more2_jax.scene import mesh_of
+from more2_jax.scene import floor_under, mesh_of
 from more2_jax.types import Mesh, Observation, SceneObject
 from train.program import run
 
@@ -138,7 +138,7 @@ def work(
     records = []
     for name, objects, spent_s in ((with_it, fitted, encoding_s + fitting_s), (without, plain, encoding_s)):
         records += [
-            scored(s, name, lambda own=own: mesh_of(prior, own, config), spent_s, o.samples)
+            scored(s, name, lambda s=s, own=own: mesh_seen(prior, s, own, config), spent_s, o.samples)
             for s, own in zip(seen, objects, strict=True)
         ]
     for name, surface in peers.items():
@@ -168,6 +168,11 @@ def embedded(prior: Prior, seen: Sequence[Seen], batch: int) -> list[SceneObject
         )
         for n, (s, code) in enumerate(zip(seen, codes, strict=True))
     ]
+
+
+def mesh_seen(prior: Prior, s: Seen, o: SceneObject, config: SceneConfig) -> Mesh | None:
+    """The mesh of an object in the room that its first scan shows."""
+    return mesh_of(prior, o, config, floor_under(o, s.scene.scans[0].background, config))
 
 
 def fitted_in_batches(

@@ -132,6 +132,7 @@ class MeshingConfig:
     seen_reach: float = (
         0.0  # canonical units: nearer to a seen point the surface runs through such points. 0: never
     )
+    floor: bool = False  # of upright scans: nothing reaches below the floor, where the room is seen
     half_width: float = 0.65  # of the query box, canonical units; objects are turned in it, so more than 0.55
 
 
@@ -226,7 +227,7 @@ def preset(name: str, *, upright: bool = False) -> SceneConfig:
                 lift_weight=0.1,
                 truncation=0.2,
             ),
-            meshing=MeshingConfig(coarse=16, resolution=64, level="observed", seen_reach=0.02),
+            meshing=MeshingConfig(coarse=16, resolution=64, level="observed", seen_reach=0.02, floor=True),
             joint=JointConfig(points=128, start="accumulated", steps=40, eqv_learning_rate=1e-3),
         )
     raise ValueError(f"preset {name!r}; needed 'paper' or 'robust'")

@@ -36,13 +36,14 @@ def extract_mesh(
     half_width: float | None = None,
     level: float = 0.0,
     seen: Float[np.ndarray, "n 3"] | None = None,
+    floor: float | None = None,
 ) -> Mesh | None:
     """A level set of one object's field, by default 0; metres in its scan's frame, always closed.
 
     `half_width` (canonical units) is half the edge of the query box. With `seen`, points of the surface in the
-    scan's frame, and a `config.seen_reach`, the surface runs through them. Returns None when the field stays
-    above `level` in the box: there is no surface to show. Raises ValueError unless `resolution` is `coarse` doubled
-    some times.
+    scan's frame, and a `config.seen_reach`, the surface runs through them. Nothing lies below the height `floor` of
+    that frame. Returns None when the field stays above `level` in the box: there is no surface to show. Raises
+    ValueError unless `resolution` is `coarse` doubled some times.
     """
     doublings = np.log2(config.resolution / config.coarse)
     if doublings < 0 or doublings != int(doublings):
@@ -50,7 +51,9 @@ def extract_mesh(
             f"resolution {config.resolution} from coarse {config.coarse}; needed a power of two times it"
         )
     half = half_width or config.half_width
-    field = partial(_evaluate, prior, embedding, level, surface_through(prior, embedding, seen, config))
+    lowest = -np.inf if floor is None else canonical(embedding, np.array([[0.0, 0.0, floor]]))[0, 2]
+    through = surface_through(prior, embedding, seen, config)
+    field = partial(_evaluate, prior, embedding, level, through, lowest)
     values = field(_grid(config.coarse, half)).reshape([config.coarse + 1] * 3)
     while len(values) - 1 < config.resolution:
         values = _refine(field, values, half)
@@ -71,7 +74,7 @@ def surface_through(
 
 def observed_level(prior: Prior, embedding: Embedding, points: Float[np.ndarray, "n 3"]) -> float:
     """The field's median at points (scan's frame) known to lie on the surface, canonical units; 0.1 at most."""
-    values = _evaluate(prior, embedding, 0.0, None, canonical(embedding, some_of(points)))
+    values = _evaluate(prior, embedding, 0.0, None, -np.inf, canonical(embedding, some_of(points)))
     return float(np.clip(np.median(values), -0.1, 0.1))
 
 
@@ -90,11 +93,13 @@ def _evaluate(
     embedding: Embedding,
     level: float,
     seen: SeenSurface | None,
+    lowest: float,
     queries: Float[np.ndarray, "p 3"],
 ) -> Float[np.ndarray, " p"]:
-    """Field at canonical offsets from the centre, less `level`, drawn towards what was seen."""
+    """Field at canonical offsets from the centre, less `level`, drawn towards what was seen, above `lowest`."""
     values = _in_chunks(_values, prior, embedding, queries) - level
-    return values if seen is None else seen.corrected(queries, values)
+    values = values if seen is None else seen.corrected(queries, values)
+    return np.maximum(values, lowest - queries[:, 2])
 
 
 def _in_chunks(

@@ -6,11 +6,12 @@ import dataclasses
 from functools import partial
 
 import numpy as np
+from jaxtyping import Float
 
 from more2_jax.config import SceneConfig
 from more2_jax.encoding import embed
 from more2_jax.fitting import embed_accumulated, fit_objects
-from more2_jax.frames import Rooms
+from more2_jax.frames import Rooms, floor_height
 from more2_jax.meshing import extract_mesh, observed_level
 from more2_jax.metrics import apply_pose
 from more2_jax.objects import (
@@ -27,6 +28,8 @@ from more2_jax.tracking import match_scan, register_in_frame
 from more2_jax.types import Frame, Instance, LivingScene, Mesh, Scan, ScanRecord, SceneObject, Skipped
 
 BACKGROUND_POINTS = 20_000  # of a scan, remembered for the page
+STRAYS = 0.02  # share of an object's points that may lie below the floor,
+BELOW_M = 0.05  # by more than this
 
 
 def start_scene(
@@ -107,7 +110,8 @@ def reconstruct(
         objects = fit_objects(prior, objects, again, config)
     with staged(timing, progress, "mesh", len(todo)) as advance:
         for done, k in enumerate(todo, start=1):
-            objects[k] = dataclasses.replace(objects[k], mesh=mesh_of(prior, objects[k], config))
+            floor = floor_under(objects[k], scene.scans[objects[k].reference_scan].background, config)
+            objects[k] = dataclasses.replace(objects[k], mesh=mesh_of(prior, objects[k], config, floor))
             advance(done)
     changes = tuple(
         changes_between(objects, c.from_scan, c.to_scan, config, c.probability) for c in scene.changes
@@ -115,14 +119,27 @@ def reconstruct(
     return dataclasses.replace(scene, objects=tuple(objects), changes=changes, timing_s=timing)
 
 
-def mesh_of(prior: Prior, o: SceneObject, config: SceneConfig) -> Mesh | None:
-    """The object's mesh, in a box that holds all that was seen of it.
+def floor_under(o: SceneObject, background: Float[np.ndarray, "b 3"], config: SceneConfig) -> float | None:
+    """Height of the floor in an object's frame, metres; `background` is that of its reference scan.
+
+    None if it is not asked for, there is none to see, or the object was seen clearly below it: then it is another's.
+    """
+    if not (config.upright and config.meshing.floor):
+        return None
+    floor = floor_height(background)
+    if floor is None or float(np.quantile(accumulated_points(o)[:, 2], STRAYS)) < floor - BELOW_M:
+        return None
+    return floor
+
+
+def mesh_of(prior: Prior, o: SceneObject, config: SceneConfig, floor: float | None = None) -> Mesh | None:
+    """The object's mesh, in a box that holds all that was seen of it, and above `floor` (metres, its frame).
 
     `level` "observed": seen points lie on the surface, so the field's median there is its bias, and is taken off.
     """
     points = accumulated_points(o)
     level = observed_level(prior, o.embedding, points) if config.meshing.level == "observed" else 0.0
-    return extract_mesh(prior, o.embedding, config.meshing, box_half_width(o, config), level, points)
+    return extract_mesh(prior, o.embedding, config.meshing, box_half_width(o, config), level, points, floor)
 
 
 def box_half_width(o: SceneObject, config: SceneConfig) -> float:

@@ -170,7 +170,22 @@ def test_the_decoder_itself_gives_a_closed_mesh_or_none(tiny_prior):
         eqv=rng.normal(size=(3, 16)).astype(np.float32),
     )
     config = MeshingConfig(coarse=8, resolution=16)
-    values = meshing._evaluate(tiny_prior, code, 0.0, None, meshing._grid(8, config.half_width))
+    values = meshing._evaluate(tiny_prior, code, 0.0, None, -np.inf, meshing._grid(8, config.half_width))
     mesh = extract_mesh(tiny_prior, code, config, level=float(np.median(values)))
     assert mesh is not None and solid(mesh).is_watertight
     assert extract_mesh(tiny_prior, code, config, level=float(values.min()) - 10.0) is None
+
+
+@pytest.mark.parametrize("height", [-0.5, -0.1, 0.2])  # canonical, from the ball's centre
+def test_nothing_lies_below_the_floor(field_is, tiny_prior, height):
+    field_is(ball)
+    floor = float(CENTER[2] + ORIGIN[2] + SCALE * height)
+    whole = solid(extract_mesh(tiny_prior, PIECE, CONFIG, floor=floor))
+    assert whole.is_watertight and (whole.vertices[:, 2] + ORIGIN[2]).min() > floor - 1e-3
+    cap = np.clip(0.4 - height, 0, 0.8)
+    assert whole.volume == pytest.approx(np.pi * cap**2 * (0.4 - cap / 3) * SCALE**3, rel=0.05)
+
+
+def test_a_floor_above_all_leaves_no_surface(field_is, tiny_prior):
+    field_is(ball)
+    assert extract_mesh(tiny_prior, PIECE, CONFIG, floor=float(ORIGIN[2] + 10)) is None

@@ -9,9 +9,9 @@ import pytest
 from factories import scene_object, turn_z
 
 from more2_jax import registration
-from more2_jax.config import JointConfig, preset
+from more2_jax.config import JointConfig, MeshingConfig, preset
 from more2_jax.objects import apply_pose, moved_probability, points_of
-from more2_jax.scene import add_scan, reconstruct, start_scene
+from more2_jax.scene import add_scan, floor_under, reconstruct, start_scene
 from more2_jax.types import Instance, Mesh, Scan
 
 MARK = Mesh(vertices=np.zeros((3, 3)), faces=np.array([[0, 1, 2]]))
@@ -179,3 +179,25 @@ def test_small_instances_are_reported_and_the_rest_goes_on(tiny_prior):
     assert len(made.objects) == 2
     with pytest.raises(ValueError, match="none with 64 points"):
         start_scene(tiny_prior, dataclasses.replace(whole, instances=(small,)), CONFIG)
+
+
+@pytest.mark.parametrize(
+    ("lowest", "settings", "floor"),
+    [
+        (0.0, {}, 0.0),  # it stands on the floor
+        (0.7, {}, 0.0),  # on a table, or its foot was hidden
+        (-0.03, {}, 0.0),  # noise
+        (-0.5, {}, None),  # down a step: this floor is not its own
+        (0.0, {"upright": False}, None),
+        (0.0, {"meshing": MeshingConfig()}, None),
+    ],
+)
+def test_the_floor_under_an_object_is_that_of_its_room(scene, lowest, settings, floor):
+    rng = np.random.default_rng(0)
+    room = np.column_stack([rng.uniform(-3, 3, (4000, 2)), 0.002 * rng.normal(size=4000)])
+    points = rng.uniform([-0.2, -0.2, lowest], [0.2, 0.2, lowest + 0.5], (500, 3))
+    o = dataclasses.replace(scene.objects[0], points=points, point_scan=np.zeros(500, int))
+    config = dataclasses.replace(preset("robust", upright=True), **settings)
+    found = floor_under(o, room, config)
+    assert found == (None if floor is None else pytest.approx(floor, abs=2e-3))
+    assert floor_under(o, np.zeros((0, 3)), config) is None
