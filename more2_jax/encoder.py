@@ -25,6 +25,7 @@ from more2_jax.vn import (
     kernel_init,
     masked_mean,
     nearest_features,
+    nearest_points,
     norm,
     paired,
     vn_leaky_relu,
@@ -62,7 +63,7 @@ class FirstBlock(nn.Module):
     @nn.compact
     def __call__(self, points: Float[Array, "n 3"], mask: Bool[Array, "n"]) -> Features:
         c = self.config
-        index, real = nearest_features(points[..., None], points[..., None], mask, c.neighbours)
+        index, real = nearest_points(points, mask, c.neighbours)
         length = jnp.sqrt(jnp.maximum(jnp.sum(points**2, axis=-1), TINY))
         kernel, direction = VNLAWeights(3, c.widths[0], name="value")()
 

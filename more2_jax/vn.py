@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
-SPARE = 8  # more candidates than neighbours asked for, before exact distances decide
+LEAST_SPARE = 4  # so many candidates more than neighbours, or half as many, before exact distances decide
 TINY = 1e-30  # guards squared norms: far below any feature, so it changes none (1e-12 would)
 FAR = 1e30  # squared distance to a row that is not there: larger than any, yet finite
 NO_DIRECTION = 1e-19  # squared; its inverse square, in the gradient of a division, is still a float32
@@ -213,6 +213,17 @@ def edge_vnla(
     return vn_leaky_relu(of_neighbour[0] + of_self[0], of_neighbour[1] + of_self[1], leak, weight)
 
 
+def nearest_points(
+    points: Float[Array, "n 3"], mask: Bool[Array, "n"], k: int
+) -> tuple[Int[Array, "n k"], Bool[Array, "n k"]]:
+    """Indices of the `k` nearest points, itself included, and which of them are real."""
+    x, y, z = jax.lax.stop_gradient(points).T
+    # Of three numbers, the sum of squared differences costs a fifth of a product of matrices and needs no second look.
+    squared = (x[:, None] - x) ** 2 + (y[:, None] - y) ** 2 + (z[:, None] - z) ** 2
+    nearest, index = jax.lax.top_k(jnp.where(mask, -squared, -jnp.inf), k)
+    return index, jnp.isfinite(nearest)
+
+
 def nearest_features(
     query: Float[Array, "n 3 c"],
     source: Float[Array, "m 3 c"],
@@ -226,7 +237,7 @@ def nearest_features(
     ones = jnp.ones((len(a), 1), a.dtype)
     rows, columns = jnp.concatenate([2 * a, -ones], axis=-1), jnp.concatenate([b, squared[:, None]], axis=-1)
     closeness = jnp.matmul(rows, columns.T, precision="highest")
-    _, candidate = jax.lax.top_k(closeness, min(k + SPARE, len(b)))
+    _, candidate = jax.lax.top_k(closeness, min(k + max(k // 2, LEAST_SPARE), len(b)))
     # The expansion cancels, and a swapped k-th neighbour moves the code by percents: the last word has the
     # sum of squared differences.
     exact = jnp.sum((a[:, None] - b[candidate]) ** 2, axis=-1)
