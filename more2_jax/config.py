@@ -126,6 +126,7 @@ class MeshingConfig:
 
     coarse: int = 32  # cells a side of the first grid
     resolution: int = 64  # of the last: `coarse`, doubled once or more
+    field_resolution: int = 0  # of the last that the field is asked on; finer ones interpolate it. 0: of all
     level: Literal["zero", "observed"] = (
         "zero"  # which level is the surface: 0, or the field's median at the points
     )
@@ -227,7 +228,9 @@ def preset(name: str, *, upright: bool = False) -> SceneConfig:
                 lift_weight=0.1,
                 truncation=0.2,
             ),
-            meshing=MeshingConfig(coarse=16, resolution=64, level="observed", seen_reach=0.02, floor=True),
+            meshing=MeshingConfig(
+                coarse=16, resolution=128, field_resolution=32, level="observed", seen_reach=0.02, floor=True
+            ),
             joint=JointConfig(points=128, start="accumulated", steps=40, eqv_learning_rate=1e-3),
         )
     raise ValueError(f"preset {name!r}; needed 'paper' or 'robust'")

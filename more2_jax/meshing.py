@@ -53,10 +53,15 @@ def extract_mesh(
     half = half_width or config.half_width
     lowest = -np.inf if floor is None else canonical(embedding, np.array([[0.0, 0.0, floor]]))[0, 2]
     through = surface_through(prior, embedding, seen, config)
-    field = partial(_evaluate, prior, embedding, level, through, lowest)
-    values = field(_grid(config.coarse, half)).reshape([config.coarse + 1] * 3)
+    ask = partial(_field, prior, embedding, level)
+    draw = partial(_drawn, through, lowest)
+    first = _grid(config.coarse, half)
+    shape = [config.coarse + 1] * 3
+    field = ask(first)
+    values, field = draw(first, field).reshape(shape), field.reshape(shape)
     while len(values) - 1 < config.resolution:
-        values = _refine(field, values, half)
+        known = 2 * (len(values) - 1) > (config.field_resolution or config.resolution)
+        field, values = _refine(None if known else ask, draw, field, values, half)
     if not (values < 0).any():
         return None
     return _surface(values, embedding, 2 * half / (len(values) - 1), half)
@@ -74,7 +79,7 @@ def surface_through(
 
 def observed_level(prior: Prior, embedding: Embedding, points: Float[np.ndarray, "n 3"]) -> float:
     """The field's median at points (scan's frame) known to lie on the surface, canonical units; 0.1 at most."""
-    values = _evaluate(prior, embedding, 0.0, None, -np.inf, canonical(embedding, some_of(points)))
+    values = _field(prior, embedding, 0.0, canonical(embedding, some_of(points)))
     return float(np.clip(np.median(values), -0.1, 0.1))
 
 
@@ -88,17 +93,21 @@ def _grid(cells: int, half: float) -> Float[np.ndarray, "p 3"]:
     return np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
 
 
-def _evaluate(
-    prior: Prior,
-    embedding: Embedding,
-    level: float,
+def _field(
+    prior: Prior, embedding: Embedding, level: float, queries: Float[np.ndarray, "p 3"]
+) -> Float[np.ndarray, " p"]:
+    """Field at canonical offsets from the centre, less `level`."""
+    return _in_chunks(_values, prior, embedding, queries) - level
+
+
+def _drawn(
     seen: SeenSurface | None,
     lowest: float,
     queries: Float[np.ndarray, "p 3"],
+    field: Float[np.ndarray, " p"],
 ) -> Float[np.ndarray, " p"]:
-    """Field at canonical offsets from the centre, less `level`, drawn towards what was seen, above `lowest`."""
-    values = _in_chunks(_values, prior, embedding, queries) - level
-    values = values if seen is None else seen.corrected(queries, values)
+    """The field drawn towards what was seen, and above `lowest`."""
+    values = field if seen is None else seen.corrected(queries, field)
     return np.maximum(values, lowest - queries[:, 2])
 
 
@@ -119,21 +128,31 @@ def _in_chunks(
 
 
 def _refine(
-    field: Callable[[Float[np.ndarray, "p 3"]], Float[np.ndarray, " p"]],
-    coarse: Float[np.ndarray, "n n n"],
+    ask: Callable[[Float[np.ndarray, "p 3"]], Float[np.ndarray, " p"]] | None,
+    draw: Callable[[Float[np.ndarray, "p 3"], Float[np.ndarray, " p"]], Float[np.ndarray, " p"]],
+    field: Float[np.ndarray, "n n n"],
+    values: Float[np.ndarray, "n n n"],
     half: float,
-) -> Float[np.ndarray, "m m m"]:
-    """The grid with half the step: evaluated near the surface, interpolated elsewhere."""
-    cells = 2 * (len(coarse) - 1)
-    values = np.asarray(zoom(coarse, (cells + 1) / len(coarse), order=1, grid_mode=False))
-    near = near_surface(coarse, 2 * half / (len(coarse) - 1))
+) -> tuple[Float[np.ndarray, "m m m"], Float[np.ndarray, "m m m"]]:
+    """Field and values on the grid with half the step: new near the surface, interpolated elsewhere.
+
+    Without `ask` the field is interpolated there too, and only what was seen draws it anew.
+    """
+    cells = 2 * (len(values) - 1)
+    near = near_surface(values, 2 * half / (len(values) - 1))
+    field, values = (
+        np.asarray(zoom(x, (cells + 1) / len(x), order=1, grid_mode=False)) for x in (field, values)
+    )
     fine = np.zeros([cells + 1] * 3, bool)
     corners = 2 * np.argwhere(near)
     for step in itertools.product(range(3), repeat=3):
         fine[tuple((corners + step).T)] = True
     fine[::2, ::2, ::2] = False  # known from the coarse grid
-    values[fine] = field(np.argwhere(fine) * (2 * half / cells) - half)
-    return values
+    queries = np.argwhere(fine) * (2 * half / cells) - half
+    if ask is not None:
+        field[fine] = ask(queries)
+    values[fine] = draw(queries, field[fine])
+    return field, values
 
 
 def near_surface(values: Float[np.ndarray, "n n n"], cell: float) -> Bool[np.ndarray, "c c c"]:

@@ -39,10 +39,10 @@ class SeenSurface:
         result = np.array(field, np.float64)
         # The nearest alone first: most of a grid is out of reach, and stays as it is.
         farthest = 2 * float(np.hypot(self.reach, self.gap))
-        near = np.flatnonzero(self.tree.query(queries, distance_upper_bound=farthest)[0] < np.inf)
+        near = np.flatnonzero(self.tree.query(queries, distance_upper_bound=farthest, workers=-1)[0] < np.inf)
         if not len(near):
             return result
-        distance, index = self.tree.query(queries[near], k=ASKED)
+        distance, index = self.tree.query(queries[near], k=ASKED, workers=-1)
         offset = np.einsum("qki,qki->qk", queries[near, None] - self.center[index], self.normal[index])
         closeness = np.exp(-0.5 * (distance**2 - distance[:, :1] ** 2) / self.gap**2)
         plane = (closeness * offset).sum(axis=1) / closeness.sum(axis=1)

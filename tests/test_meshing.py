@@ -170,7 +170,7 @@ def test_the_decoder_itself_gives_a_closed_mesh_or_none(tiny_prior):
         eqv=rng.normal(size=(3, 16)).astype(np.float32),
     )
     config = MeshingConfig(coarse=8, resolution=16)
-    values = meshing._evaluate(tiny_prior, code, 0.0, None, -np.inf, meshing._grid(8, config.half_width))
+    values = meshing._field(tiny_prior, code, 0.0, meshing._grid(8, config.half_width))
     mesh = extract_mesh(tiny_prior, code, config, level=float(np.median(values)))
     assert mesh is not None and solid(mesh).is_watertight
     assert extract_mesh(tiny_prior, code, config, level=float(values.min()) - 10.0) is None
@@ -189,3 +189,20 @@ def test_nothing_lies_below_the_floor(field_is, tiny_prior, height):
 def test_a_floor_above_all_leaves_no_surface(field_is, tiny_prior):
     field_is(ball)
     assert extract_mesh(tiny_prior, PIECE, CONFIG, floor=float(ORIGIN[2] + 10)) is None
+
+
+def test_a_field_asked_less_finely_is_interpolated(field_is, tiny_prior):
+    asked = field_is(ball)
+    every = extract_mesh(tiny_prior, PIECE, CONFIG)
+    of_every = sum(asked)
+    same = extract_mesh(tiny_prior, PIECE, dataclasses.replace(CONFIG, field_resolution=64))
+    np.testing.assert_array_equal(every.vertices, same.vertices)
+    asked.clear()
+    some = extract_mesh(tiny_prior, PIECE, dataclasses.replace(CONFIG, field_resolution=32))
+    assert sum(asked) < of_every / 2
+    step = 2 * CONFIG.half_width / 32
+    # A straight line between two points of a field of curvature c is at most c step² / 8 off, along three axes.
+    most = 3 * step**2 / 8 / (0.4 - step)
+    radius = np.linalg.norm(canonical(some), axis=1)
+    assert 1e-4 < np.abs(radius - 0.4).max() < most
+    assert solid(some).is_watertight

@@ -129,3 +129,17 @@ def test_at_most_so_many_points_are_kept_from_first_to_last():
     kept = some_of(points)
     assert len(kept) == MOST and (kept[[0, -1]] == points[[0, -1]]).all()
     np.testing.assert_array_equal(some_of(points[:10]), points[:10])
+
+
+def test_what_was_seen_is_drawn_finer_than_the_field_is_asked(ball_of_036, tiny_prior):
+    waves = sphere(4000, 1.0)
+    radius = 0.37 + 0.01 * np.sin(
+        8 * np.arctan2(waves[:, 1], waves[:, 0])
+    )  # a wave is 0.3 long: 4 of 16 cells
+    config = MeshingConfig(coarse=16, resolution=64, field_resolution=16, seen_reach=REACH)
+    mesh = extract_mesh(tiny_prior, PIECE, config, seen=in_scan(waves * radius[:, None]))
+    p = in_canonical(mesh.vertices)
+    p = p[np.abs(p[:, 2]) < 0.2]
+    expected = 0.37 + 0.01 * np.sin(8 * np.arctan2(p[:, 1], p[:, 0]))
+    off = np.abs(np.linalg.norm(p, axis=1) - expected)
+    assert np.quantile(off, 0.9) < 0.005  # half a wave's height; the ball that the field believes in is 0.01 off
