@@ -57,7 +57,8 @@ def test_the_words_are_all_there(opened):
     assert "m and turned by 90°" in item
     assert "<b>chair & co</b>" in item  # a name from a file, as text
     assert page.locator("[data-id=object_004] .doubt").is_visible()
-    assert page.locator("[data-id=object_001] .doubt").is_hidden()
+    assert page.locator("[data-id=object_001] .doubt").is_visible()  # it may have changed places
+    assert page.locator("[data-id=object_000] .doubt").is_hidden()
 
 
 def test_without_3d_the_words_remain(opened):

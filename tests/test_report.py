@@ -143,7 +143,7 @@ def test_motion_in_words(distance, angle, says):
 
 def doubtful(**seen) -> Verdict:
     o = SCENE.objects[1]
-    worse = dataclasses.replace(o.observations[1], **seen)
+    worse = dataclasses.replace(o.observations[1], **{"interchangeable": False} | seen)
     return verdict(dataclasses.replace(o, observations=(o.observations[0], worse)), SCENE.changes[0])
 
 
@@ -159,6 +159,10 @@ def test_doubts_are_told():
     assert doubtful(converged=False).doubts == ("its new position did not settle",)
     assert "match score 0.20" in doubtful(score=0.2).doubts[0]
     assert len(doubtful(score=-1.0, converged=False).doubts) == 2
+    assert doubtful(interchangeable=True).doubts == (
+        "it may have changed places with a piece that looks the same",
+    )
+    assert "left out of its shape" in doubtful(accumulated=False).doubts[0]
     assert headline(SCENE, [doubtful(score=0.2)], 0, 1).endswith("1 object moved. 1 of these is unsure.")
 
 

@@ -142,4 +142,6 @@ def test_what_was_seen_is_drawn_finer_than_the_field_is_asked(ball_of_036, tiny_
     p = p[np.abs(p[:, 2]) < 0.2]
     expected = 0.37 + 0.01 * np.sin(8 * np.arctan2(p[:, 1], p[:, 0]))
     off = np.abs(np.linalg.norm(p, axis=1) - expected)
-    assert np.quantile(off, 0.9) < 0.005  # half a wave's height; the ball that the field believes in is 0.01 off
+    assert (
+        np.quantile(off, 0.9) < 0.005
+    )  # half a wave's height; the ball that the field believes in is 0.01 off

@@ -60,6 +60,8 @@ def doubts_of(o: SceneObject, seen: Observation) -> list[str]:
         doubts.append(f"it may be another object: match score {seen.score:.2f}, below {LOW_SCORE:.2f}")
     if not seen.accumulated:
         doubts.append("what was seen of it does not fit well: left out of its shape")
+    if seen.interchangeable:
+        doubts.append("it may have changed places with a piece that looks the same")
     return doubts
 
 
