@@ -29,7 +29,10 @@ FREE, UPRIGHT = (
 )
 PAPER = RegistrationConfig(points=64, sdf_points=64, steps=5, icp_steps=3)
 # Random weights any way up, shipped weights upright.
-CASES = [("tiny", False), *[(name, True) for name in shipped_priors()]]
+CASES = [
+    ("tiny", False),
+    *[pytest.param(name, True, marks=[pytest.mark.slow] * (name != "small")) for name in shipped_priors()],
+]
 
 
 def clouds_of(clouds):

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+from importlib import resources
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -16,9 +18,13 @@ from more2_jax.data.scans import read_scan
 from more2_jax.geometry import farthest_points
 from more2_jax.prior import encode, encode_ordered, load_prior, shipped_priors
 
+LARGEST_MB = 16  # of a file of weights
 
-def test_small_is_shipped():
-    assert "small" in shipped_priors()
+
+def test_small_and_base_are_shipped_in_files_that_are_not_too_large():
+    assert shipped_priors() == ["base", "small"]
+    folder = Path(str(resources.files("more2_jax"))) / "assets" / "weights"
+    assert all(p.stat().st_size <= LARGEST_MB * 1_000_000 for p in folder.iterdir())
 
 
 def moves(count):
