@@ -19,6 +19,8 @@ from more2_jax.geometry import farthest_points
 from more2_jax.prior import encode, encode_ordered, load_prior, shipped_priors
 
 LARGEST_MB = 16  # of a file of weights
+# `base` obeys the same laws, ten times as slowly.
+PRIORS = [pytest.param(n, marks=[pytest.mark.slow] * (n != "small")) for n in shipped_priors()]
 
 
 def test_small_and_base_are_shipped_in_files_that_are_not_too_large():
@@ -38,7 +40,7 @@ def demo_clouds():
     return [i.points[::3] for i in read_scan(demo_scan_paths()[0]).instances]
 
 
-@pytest.mark.parametrize("name", shipped_priors())
+@pytest.mark.parametrize("name", PRIORS)
 def test_shipped_weights_are_equivariant(name):
     """Φ(sRX + t) = (F_inv, R F_eqv, s F_s, sR F_c + t) to 1e-10 of each part, in double precision."""
     with jax.enable_x64(True):
@@ -65,7 +67,7 @@ def agree(found, expected, most):
 encode_double = jax.jit(encode_ordered)
 
 
-@pytest.mark.parametrize("name", shipped_priors())
+@pytest.mark.parametrize("name", PRIORS)
 def test_shipped_weights_are_equivariant_up_to_ties_in_single_precision(name):
     """The whole way from clouds kilometres apart, in float32: to 1e-4, but for clouds in which rounding decides.
 
