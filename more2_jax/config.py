@@ -126,7 +126,7 @@ class MeshingConfig:
 
     coarse: int = 32  # cells a side of the first grid
     resolution: int = 64  # of the last: `coarse`, doubled once or more
-    field_resolution: int = 0  # of the last that the field is asked on; finer ones interpolate it. 0: of all
+    field_resolution: int = 0  # grids of up to so many ask the field, finer ones interpolate. 0: all ask
     level: Literal["zero", "observed"] = (
         "zero"  # which level is the surface: 0, or the field's median at the points
     )

@@ -151,9 +151,8 @@ def decoder_weights(fresh: Weights, known: Weights, old: PriorConfig, new: Prior
     """The decoder's dense layers, by the names of `fresh`."""
     before, after = old.decoder, new.decoder
     hidden, code = (before.hidden, after.hidden), (old.encoder.code, new.encoder.code)
-    rest = (
-        len(known["decoder/layer_0/direction"]) - 2 * code[0]
-    )  # the query's distance, and what is looked up
+    # The query's distance, and what is looked up.
+    rest = len(known["decoder/layer_0/direction"]) - 2 * code[0]
     inputs = [code, code, (rest, rest)]
     ratios = old.inv_gain / new.inv_gain, old.eqv_gain / new.eqv_gain, 1.0
     gains = np.repeat(ratios, (code[0], code[0], rest))
