@@ -107,6 +107,7 @@ class Compared:
     size: Float[np.ndarray, "*pairs"]  # |log| of the ratio of the F_s
     likeness: Float[np.ndarray, "*pairs"]  # cosine of the F_inv
     top_m: Float[np.ndarray, "*pairs"]  # difference of the heights of their highest points
+    color: Float[np.ndarray, "*pairs"]  # log likelihood ratio of their colours (`color.color_evidence`)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -135,4 +136,5 @@ def log_odds(evidence: Evidence, compared: Compared, upright: bool) -> Float[np.
     lift = np.minimum(np.asarray(evidence.lift) / (LIFTED * radius), 1.0)
     top = np.minimum(compared.top_m / radius, HIGHEST)
     fit = c.intercept + c.nearer * ways.min(axis=0) + c.farther * ways.max(axis=0)
-    return fit + c.size * compared.size + c.likeness * compared.likeness + c.lift * lift + c.top * top
+    fit += c.size * compared.size + c.likeness * compared.likeness + c.lift * lift + c.top * top
+    return fit + compared.color

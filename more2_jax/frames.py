@@ -65,7 +65,8 @@ def moved(known: Known, T_b_a: Pose) -> Known:
     """What is known of an object, in another frame."""
     if np.array_equal(T_b_a, np.eye(4)):
         return known
-    return Known(points=apply_pose(T_b_a, known.points), embedding=moved_embedding(known.embedding, T_b_a))
+    embedding = moved_embedding(known.embedding, T_b_a)
+    return dataclasses.replace(known, points=apply_pose(T_b_a, known.points), embedding=embedding)
 
 
 def lift(height_m: float) -> Pose:

@@ -27,6 +27,7 @@ from more2_jax.report import write_report
 from more2_jax.types import (
     Anchors,
     Changes,
+    Color,
     Embedding,
     Frame,
     LivingScene,
@@ -242,6 +243,7 @@ def _object_to_json(o: SceneObject) -> dict[str, Any]:
         ],
         "mesh": None if o.mesh is None else _mesh_name(o),
         "points": _points_name(o),
+        "color": None if o.color is None else {"points": o.color.points, "lab": o.color.lab.tolist()},
     }
 
 
@@ -355,4 +357,12 @@ def _object(
         point_scan=point_scan,
         embedding=embedding,
         mesh=None if o["mesh"] is None else read_mesh(folder / o["mesh"]),
+        color=_color(o.get("color")),
     )
+
+
+def _color(content: dict[str, Any] | None) -> Color | None:
+    """The colour of an object; None where the file names none."""
+    if content is None:
+        return None
+    return Color(points=content["points"], lab=np.array(content["lab"], np.float64))

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.special import ndtr
 
+from more2_jax.color import color_of, pooled
 from more2_jax.config import SceneConfig
 from more2_jax.metrics import apply_pose, rotation_error_deg
 from more2_jax.types import Changes, Embedding, Frame, Instance, Observation, SceneObject
@@ -43,6 +44,7 @@ def new_object(
         points=instance.points,
         point_scan=np.full(len(instance.points), scan),
         embedding=embedding,
+        color=color_of(instance.colors),
     )
 
 
@@ -54,6 +56,7 @@ def seen_again(o: SceneObject, instance: Instance, seen: Observation) -> SceneOb
         points=np.concatenate([o.points, apply_pose(seen.T_ref_scan, instance.points)]),
         point_scan=np.concatenate([o.point_scan, np.full(len(instance.points), seen.scan)]),
         mesh=None if seen.accumulated else o.mesh,
+        color=pooled(o.color, color_of(instance.colors)) if seen.accumulated else o.color,
     )
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.special import expit
 
+from more2_jax.color import color_of
 from more2_jax.config import SceneConfig
 from more2_jax.encoding import padded, stack, with_origin
 from more2_jax.frames import Rooms, common_frame, moved, settled_frame
@@ -90,7 +91,10 @@ def verified(
 ) -> Identified:
     """The assignment that geometry finds likeliest, with probabilities, and the frame of the scan."""
     old = [last_seen(o)[0] for o in objects]
-    new = [Known(points=i.points, embedding=e) for i, e in zip(instances, embeddings, strict=True)]
+    new = [
+        Known(points=i.points, embedding=e, color=color_of(i.colors))
+        for i, e in zip(instances, embeddings, strict=True)
+    ]
     frame, fits = common_frame(old, new, config, rooms)
     odds = fits.odds
     centers = apply_pose(frame.T_scene_scan, np.stack([i.points.mean(axis=0) for i in instances]))
@@ -113,7 +117,7 @@ def distances(objects: Sequence[SceneObject], centers: Float[np.ndarray, "m 3"])
 def last_seen(o: SceneObject) -> tuple[Known, Pose]:
     """All accumulated of an object, where it last stood in the scene, and the pose from there to its own frame."""
     T_scene_ref = place_of(o.observations[-1])
-    known = Known(points=accumulated_points(o), embedding=o.embedding)
+    known = Known(points=accumulated_points(o), embedding=o.embedding, color=o.color)
     return moved(known, T_scene_ref), np.linalg.inv(T_scene_ref)
 
 

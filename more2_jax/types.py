@@ -119,6 +119,14 @@ class Mesh:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Color:
+    """The mean colour of points in CIE L*a*b* (D65), and of how many."""
+
+    points: int
+    lab: Float[np.ndarray, "3"]
+
+
+@dataclass(frozen=True, kw_only=True)
 class Instance:
     """One object as one scan saw it; metres, in the scan's frame, float64."""
 
@@ -192,6 +200,7 @@ class SceneObject:
     point_scan: Int[np.ndarray, "n"]
     embedding: Embedding  # NumPy leaves, unbatched; frame of the reference observation
     mesh: Mesh | None = None
+    color: Color | None = None  # of the accumulated observations whose scans have colours
 
 
 @dataclass(frozen=True, kw_only=True)

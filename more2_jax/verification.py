@@ -20,10 +20,11 @@ from scipy.spatial.transform import Rotation
 from scipy.special import expit
 
 from more2_jax.batching import bucket
+from more2_jax.color import color_evidence
 from more2_jax.config import SceneConfig
 from more2_jax.encoding import at_zero, padded, stack, with_origin
 from more2_jax.evidence import HYPOTHESES, Compared, log_odds, pair_evidence
-from more2_jax.types import Embedding
+from more2_jax.types import Color, Embedding
 
 Points = Float[np.ndarray, "_ 3"]
 LogOdds = Float[np.ndarray, "n m"]
@@ -42,6 +43,7 @@ class Known:
 
     points: Points
     embedding: Embedding
+    color: Color | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -115,12 +117,17 @@ def heights(side: Sequence[Known]) -> tuple[Float[np.ndarray, " k"], Float[np.nd
 
 
 def compared(old: Sequence[Known], new: Sequence[Known]) -> Compared:
-    """Every object with every instance, by size, code and height."""
+    """Every object with every instance, by size, code, height and colour."""
     a, b = (np.array([float(k.embedding.scale) for k in side]) for side in (old, new))
     x, y = (np.stack([np.asarray(k.embedding.inv, np.float64) for k in side]) for side in (old, new))
     x, y = (v / np.maximum(np.linalg.norm(v, axis=1, keepdims=True), 1e-30) for v in (x, y))
     (_, top), (_, other) = heights(old), heights(new)
-    return Compared(size=np.abs(np.log(a[:, None] / b)), likeness=x @ y.T, top_m=np.abs(top[:, None] - other))
+    return Compared(
+        size=np.abs(np.log(a[:, None] / b)),
+        likeness=x @ y.T,
+        top_m=np.abs(top[:, None] - other),
+        color=color_evidence([k.color for k in old], [k.color for k in new]),
+    )
 
 
 def proposed(score: LogOdds, count: int) -> Bool[np.ndarray, "n m"]:

@@ -13,7 +13,7 @@ from places import ROOT
 # Before anything of more2_jax is imported: every call's shapes and dtypes are held against its annotations. Not in
 # `types`, whose records pass through JAX's transformations, nor where values of any kind are taken and refused.
 CHECKED = (
-    "batching decoder descent encoder encoding geometry joint losses matching meshing metrics objects prior "
+    "batching color decoder descent encoder encoding geometry joint losses matching meshing metrics objects prior "
     "registration starts tracking vn"
 )
 install_import_hook([f"more2_jax.{name}" for name in CHECKED.split()], "beartype.beartype")

@@ -15,7 +15,7 @@ LONGEST_FILE, LONGEST_FUNCTION = 400, 40  # lines
 # Low to high; a module imports from its own layer or those before it. `data.*` and `commands.*` are folders.
 LAYERS = {
     "types": ("types", "config", "progress"),
-    "tools": ("geometry", "nearest_grid", "batching", "descent", "metrics", "meshfile", "data"),
+    "tools": ("geometry", "nearest_grid", "batching", "descent", "metrics", "meshfile", "color", "data"),
     "network": (
         "vn",
         "neighbours",

@@ -37,6 +37,7 @@ def test_vertices_keep_their_objects(tmp_path, strings, by):
     assert {i.id: i.label for i in scan.instances} == {4: "couch table", 35: "chair"}
     for instance in scan.instances:
         np.testing.assert_allclose(instance.points, POINTS[instance.id == IDS], atol=1e-6)
+        assert instance.colors is None  # they paint the instances
     np.testing.assert_allclose(scan.background, POINTS[np.isin(IDS, [0, 1])], atol=1e-6)
     assert {s.what for s in scan.skipped} == {"instance 1 (floor)", "instance 77 (pillow)"}
     assert scan.warnings == ()

@@ -40,8 +40,8 @@ def read_scan(
 
     `path` is a PLY whose vertices carry an integer property naming the instance (`instance`, `instance_id`,
     `objectId`, `object_id` or `label`, in this order; `instance_property` names another), an NPZ with
-    `points` (n, 3), `instance` (n,) and optional `label` (n,), `color` (n, 3), a folder of one PLY per object,
-    or another of `data.formats.registry`. Instance ids ≤ 0 are background. `unit` is the file's: m, cm or mm.
+    `points` (n, 3), `instance` (n,) and optional `label` (n,), `color` or `colors` (n, 3), a folder of one PLY per
+    object, or another of `data.formats.registry`. Instance ids ≤ 0 are background. `unit` is the file's: m, cm or mm.
     Instances of fewer than `min_points` points are reported in `Scan.skipped`; sizes that look like another
     unit, in `Scan.warnings`. `masks` are predicted ones (`data.masks`): those scored `min_score` or more replace
     the scan's own. `segment="geometric"` cuts a cloud without instances into planes and clusters; `depth_frames`

@@ -10,8 +10,9 @@ from more2_jax.types import LivingScene
 
 
 def write_poses(scene: LivingScene, path: Path, scan: int) -> None:
-    """What scene.json holds, less the names of files beside it; `scan` chooses nothing, all scans are written."""
+    """What scene.json holds, less colours and names of files beside it; `scan` chooses nothing: all are written."""
     content = scene_to_json(scene)
-    objects = [{k: v for k, v in o.items() if k not in ("mesh", "points")} for o in content.pop("objects")]
+    left_out = ("mesh", "points", "color")
+    objects = [{k: v for k, v in o.items() if k not in left_out} for o in content.pop("objects")]
     text = json.dumps(content | {"up_axis": "z", "objects": objects}, indent=1, allow_nan=False)
     path.write_text(text + "\n", encoding="utf-8")

@@ -1,4 +1,4 @@
-"""An NPZ with `points` (n, 3), `instance` (n,) and optional `label`, `color`."""
+"""An NPZ with `points` (n, 3), `instance` (n,) and optional `label`, `color` (or `colors`)."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 from more2_jax.data.labelled import LabelledCloud, ReadOptions, instance_ids
 from more2_jax.data.npz_file import read_arrays
 
+COLORS = ("color", "colors")  # the first that is there
 HOW = " (name the instances with --instance-property, or cut the scan with --segment geometric)"
 
 
@@ -19,7 +20,7 @@ def recognises(path: Path) -> bool:
 
 def read(path: Path, options: ReadOptions) -> LabelledCloud:
     key = options.instance_property or "instance"
-    arrays, names = read_arrays(path, ("points", key, "label", "color"))
+    arrays, names = read_arrays(path, ("points", key, "label", *COLORS))
     segmented = not options.masks_needed and options.instance_property is None
     if missing := [k for k in ("points", *((key,) if not segmented else ())) if k not in arrays]:
         raise ValueError(f"{path}: arrays are {names}; needed {' and '.join(missing)} too" + HOW)
@@ -28,14 +29,15 @@ def read(path: Path, options: ReadOptions) -> LabelledCloud:
     return LabelledCloud(
         points=arrays["points"].astype(np.float64),
         instance=instance_ids(path, arrays[key]) if key in arrays else None,
-        colors=_colors(arrays.get("color")),
+        colors=_colors(next((arrays[k] for k in COLORS if k in arrays), None)),
         point_labels=labels,
     )
 
 
 def _check_npz(path: Path, arrays: dict[str, np.ndarray], key: str) -> None:
     points, count = arrays["points"], len(np.atleast_1d(arrays["points"]))
-    needed = {"points": ((count, 3), "iuf"), key: ((count,), "iu"), "color": ((count, 3), "iuf")}
+    needed = {"points": ((count, 3), "iuf"), key: ((count,), "iu")}
+    needed |= dict.fromkeys(COLORS, ((count, 3), "iuf"))
     needed |= {"label": ((count,), "iuUS")} if key != "label" else {}
     if points.ndim != 2:
         raise ValueError(f"{path}: points have shape {points.shape}; needed (n, 3)")

@@ -1,11 +1,13 @@
 """3RScan (Wald et al. 2019; METHOD 8): a scan's folder, read from its annotated mesh or its raw depth frames.
 
 `labels.instances.annotated.v2.ply` gives every vertex its `objectId` (0: none), `semseg.v2.json` the labels.
+The mesh's colours paint the instances (`ply_color` of 3DSSG's `objects.json`), in which the truth shows: never read.
 Points are in the scan's own frame, z up, metres; `more2_jax.data.threerscan_index` has the poses between scans.
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -55,23 +57,22 @@ def read(path: Path, options: ReadOptions) -> LabelledCloud:
     if annotated is None:
         return _without_masks(folder, options)
     if options.instance_property not in (None, OBJECT):
-        return ply_scan.read(annotated, options)
+        return replace(ply_scan.read(annotated, options), colors=None)
     cloud = read_ply(annotated)
     if not np.isfinite(cloud.points).all():
         raise ValueError(f"{annotated}: vertices with NaN or infinite coordinates")
     instance = _instances(annotated, cloud)
     labels, empty, remarks = _labels(folder, instance)
     instance, structural = drop_background(instance, labels)
-    points, colors, skipped = cloud.points, cloud.colors, (*structural, *empty)
+    points, skipped = cloud.points, (*structural, *empty)
     if options.depth_frames:
         sequence = open_sequence(folder)
         found, lost = depth_points(sequence)
         instance = nearest_instance(cloud.points, instance, found)
-        points, colors, skipped = found, None, (*skipped, *lost)
+        points, skipped = found, (*skipped, *lost)
     return LabelledCloud(
         points=points,
         instance=None if options.masks else instance,
-        colors=colors,
         labels=labels,
         skipped=skipped,
         unit="m",
