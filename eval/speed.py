@@ -27,6 +27,8 @@ from eval.stopwatch import Job, Seconds, interleaved, timed
 from more2_jax.config import PriorConfig, TrainingRun, load_config
 from more2_jax.decoder import Decoder
 from more2_jax.geometry import farthest_points
+from more2_jax.in_turn import in_turn
+from more2_jax.losses import AT_ONCE
 from more2_jax.prior import Prior, encode_ordered, init_prior
 from train.memory import GLIBC_KEEPS_MEMORY, keep_freed_memory
 from train.program import run
@@ -119,12 +121,17 @@ def jax_jobs(model: PriorConfig, batch: tuple[Array, Array, Array], plain: bool)
         p = dataclasses.replace(prior, params=params)
         return jax.vmap(lambda x: outputs(p, x, plain))(points)
 
+    def over(one: Any, rows: Any) -> Any:  # ours as training does it
+        return jax.vmap(one)(rows) if plain else in_turn(one, rows, max(1, AT_ONCE // batch[0].shape[1]))
+
     def squares(params: Any, points: Array) -> Array:
-        return sum((jnp.sum(x**2) for x in forward(params, points)), jnp.zeros(()))
+        p = dataclasses.replace(prior, params=params)
+        found = over(lambda x: outputs(p, x, plain), points)
+        return sum((jnp.sum(x**2) for x in found), jnp.zeros(()))
 
     def loss(params: Any, points: Array, queries: Array, truth: Array) -> Array:
         p = dataclasses.replace(prior, params=params)
-        found = jax.vmap(lambda x, q: distances(p, x, q, plain))(points, queries)
+        found = over(lambda row: distances(p, *row, plain), (points, queries))
         return jnp.abs(found - truth).mean()
 
     def step(params: Any, state: Any, *batch: Array) -> Any:

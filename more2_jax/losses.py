@@ -11,9 +11,11 @@ from jaxtyping import Float
 from more2_jax.config import TrainingConfig
 from more2_jax.data.sampling import TrainingSample
 from more2_jax.decoder import Decoder
+from more2_jax.in_turn import in_turn
 from more2_jax.prior import Prior, encode_ordered
 from more2_jax.types import Embedding
 
+AT_ONCE = 1024  # points of clouds that a CPU encodes side by side
 LEAST_CORRELATION = 0.05  # of two F_eqv, whose norms are 1: below it their rotation is noise, and pulls less
 
 
@@ -72,10 +74,13 @@ def rotation_loss(eqv: Float[Array, "b 2 3 c"]) -> Float[Array, ""]:
 
 
 def total_loss(
-    prior: Prior, sample: TrainingSample, config: TrainingConfig, dropout_key: Array
+    prior: Prior, sample: TrainingSample, config: TrainingConfig, dropout_key: Array, devices: int = 1
 ) -> tuple[Float[Array, ""], dict[str, Float[Array, ""]]]:
-    """The training loss of a batch and its terms; shapes are canonical, so F_c → 0 and F_s → 1."""
-    embedding, predicted = predict(prior, sample, dropout_key, train=True)
+    """The training loss of a batch and its terms; shapes are canonical, so F_c → 0 and F_s → 1.
+
+    `devices`: how many share the batch.
+    """
+    embedding, predicted = predict(prior, sample, dropout_key, train=True, devices=devices)
     terms = {
         "sdf": sdf_loss(predicted, sample.sdf, config.near_surface),
         "center": jnp.mean(jnp.linalg.norm(embedding.center - sample.center + 1e-12, axis=-1)),
@@ -102,14 +107,18 @@ def total_loss(
 
 
 def predict(
-    prior: Prior, sample: TrainingSample, dropout_key: Array, train: bool
+    prior: Prior, sample: TrainingSample, dropout_key: Array, train: bool, devices: int = 1
 ) -> tuple[Embedding, Float[Array, "b 2 q"]]:
     """Encodes both clouds of every shape and decodes the queries with each cloud's own code."""
-    embedding = jax.vmap(jax.vmap(lambda p, m: encode_ordered(prior, p, m)))(sample.points, sample.mask)
     decoder, weights = Decoder(prior.config), {"params": prior.params["decoder"]}
 
-    def decode(e: Embedding, q: Float[Array, "q 3"], key: Array) -> Float[Array, " q"]:
-        return decoder.apply(weights, e, q, train, rngs={"dropout": key})  # type: ignore[return-value]
+    def one(cloud: tuple[Array, Array, Array, Array]) -> tuple[Embedding, Array]:
+        points, mask, queries, key = cloud
+        e = encode_ordered(prior, points, mask)
+        return e, decoder.apply(weights, e, queries, train, rngs={"dropout": key})  # type: ignore[return-value]
 
     keys = jax.random.split(dropout_key, sample.sdf.shape[:2])
-    return embedding, jax.vmap(jax.vmap(decode))(embedding, sample.queries, keys)
+    by_shape = (sample.points, sample.mask, sample.queries, keys)
+    clouds = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), by_shape)
+    found = in_turn(one, clouds, max(1, AT_ONCE // sample.points.shape[2]), devices)
+    return jax.tree.map(lambda x: x.reshape(-1, 2, *x.shape[1:]), found)

@@ -80,7 +80,8 @@ def training_step(
     sample, dropout_key = draw(shapes, rows, state.step, model, config, mesh)
 
     def loss(params: dict[str, Any]) -> tuple[Array, dict[str, Array]]:
-        return total_loss(Prior(params=params, config=model), sample, config, dropout_key)
+        prior = Prior(params=params, config=model)
+        return total_loss(prior, sample, config, dropout_key, mesh.size)
 
     gradient, terms = jax.grad(loss, has_aux=True)(state.params)
     updates, opt_state = optimiser(config).update(gradient, state.optimiser, state.params)
