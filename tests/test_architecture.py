@@ -23,6 +23,7 @@ LAYERS = {
         "local_field",
         "decoder",
         "prior",
+        "in_turn",
         "losses",
         "published",
         "checkpoint",
