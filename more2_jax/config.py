@@ -133,6 +133,8 @@ class MeshingConfig:
     seen_reach: float = (
         0.0  # canonical units: nearer to a seen point the surface runs through such points. 0: never
     )
+    # On grids finer than `field_resolution`, so near (canonical units) to seen points their sides count, not its.
+    screening: float = 0.0
     floor: bool = False  # of upright scans: nothing reaches below the floor, where the room is seen
     half_width: float = 0.65  # of the query box, canonical units; objects are turned in it, so more than 0.55
 
@@ -229,7 +231,13 @@ def preset(name: str, *, upright: bool = False) -> SceneConfig:
                 truncation=0.2,
             ),
             meshing=MeshingConfig(
-                coarse=16, resolution=128, field_resolution=32, level="observed", seen_reach=0.02, floor=True
+                coarse=16,
+                resolution=128,
+                field_resolution=32,
+                level="observed",
+                seen_reach=0.02,
+                screening=0.08,
+                floor=True,
             ),
             joint=JointConfig(points=128, start="accumulated", steps=40, eqv_learning_rate=1e-3),
         )

@@ -52,29 +52,36 @@ def extract_mesh(
         )
     half = half_width or config.half_width
     lowest = -np.inf if floor is None else canonical(embedding, np.array([[0.0, 0.0, floor]]))[0, 2]
-    through = surface_through(prior, embedding, seen, config)
+    through = surface_through(prior, embedding, seen, config, lowest)
     ask = partial(_field, prior, embedding, level)
     draw = partial(_drawn, through, lowest)
     first = _grid(config.coarse, half)
     shape = [config.coarse + 1] * 3
     field = ask(first)
     values, field = draw(first, field).reshape(shape), field.reshape(shape)
+    asked = config.field_resolution or config.resolution
     while len(values) - 1 < config.resolution:
-        known = 2 * (len(values) - 1) > (config.field_resolution or config.resolution)
-        field, values = _refine(None if known else ask, draw, field, values, half)
+        if through is not None and config.screening and len(values) - 1 == asked:
+            field, values = _sided(through, config.screening, lowest, field, half)
+            continue
+        field, values = _refine(ask if 2 * (len(values) - 1) <= asked else None, draw, field, values, half)
     if not (values < 0).any():
         return None
     return _surface(values, embedding, 2 * half / (len(values) - 1), half)
 
 
 def surface_through(
-    prior: Prior, embedding: Embedding, seen: Float[np.ndarray, "n 3"] | None, config: MeshingConfig
+    prior: Prior,
+    embedding: Embedding,
+    seen: Float[np.ndarray, "n 3"] | None,
+    config: MeshingConfig,
+    lowest: float = -np.inf,
 ) -> SeenSurface | None:
     """What was seen, as planes around the points. None if nothing was, or it is not asked for."""
     if seen is None or not config.seen_reach:
         return None
     points = canonical(embedding, some_of(seen))
-    return seen_surface(points, _in_chunks(_slopes, prior, embedding, points), config.seen_reach)
+    return seen_surface(points, _in_chunks(_slopes, prior, embedding, points), config.seen_reach, lowest)
 
 
 def observed_level(prior: Prior, embedding: Embedding, points: Float[np.ndarray, "n 3"]) -> float:
@@ -153,6 +160,18 @@ def _refine(
         field[fine] = ask(queries)
     values[fine] = draw(queries, field[fine])
     return field, values
+
+
+def _sided(
+    through: SeenSurface, screening: float, lowest: float, field: Float[np.ndarray, "n n n"], half: float
+) -> tuple[Float[np.ndarray, "m m m"], Float[np.ndarray, "m m m"]]:
+    """Field and values on the grid with half the step: inside and outside as what was seen has them, near it."""
+    cells = 2 * (len(field) - 1)
+    finer = np.asarray(zoom(field, (cells + 1) / len(field), order=1, grid_mode=False))
+    queries = _grid(cells, half)
+    finer = np.maximum(finer.ravel(), lowest - queries[:, 2]).reshape(finer.shape)
+    field = through.screened(finer, half, screening)
+    return field, _drawn(through, lowest, queries, field.ravel()).reshape(field.shape)
 
 
 def near_surface(values: Float[np.ndarray, "n n n"], cell: float) -> Bool[np.ndarray, "c c c"]:

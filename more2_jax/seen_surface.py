@@ -2,8 +2,8 @@
 
 Beyond the paper. A code and a few hundred anchors keep a piece's shape, not the millimetres of the points they came
 from. So near them the field gives way to the distance from the planes that neighbouring points lie in (implicit
-moving least squares); which side of a plane is inside, the points do not say, and the field's slope decides. Farther
-away the field alone goes on: what nobody saw is still completed.
+moving least squares), and a little farther away to the sides that these planes have (`screened_poisson.py`). Farther
+off the field alone goes on: what nobody saw is still completed.
 """
 
 from __future__ import annotations
@@ -14,12 +14,16 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial import KDTree
 
+from more2_jax.orientation import outward_signs
+from more2_jax.screened_poisson import Grid, areas, screened
+
 NEIGHBOURS = 12  # points of a plane
 ASKED = 8  # planes a query hears
 MOST = 4096  # points that are kept
 GAP = 3.0  # median distances between neighbours
 LEAST_GAP = 1e-3  # canonical units; where points are doubled
 FEWEST = NEIGHBOURS + 1  # fewer make no surface
+ONE_FACE = 4  # power of the cosine to the nearest plane's normal: the other face of a thin board is not heard
 
 Points = Float[np.ndarray, "_ 3"]
 
@@ -45,6 +49,8 @@ class SeenSurface:
         distance, index = self.tree.query(queries[near], k=ASKED, workers=-1)
         offset = np.einsum("qki,qki->qk", queries[near, None] - self.center[index], self.normal[index])
         closeness = np.exp(-0.5 * (distance**2 - distance[:, :1] ** 2) / self.gap**2)
+        agree = np.einsum("qki,qi->qk", self.normal[index], self.normal[index[:, 0]])
+        closeness *= np.maximum(agree, 0.0) ** ONE_FACE
         plane = (closeness * offset).sum(axis=1) / closeness.sum(axis=1)
         # Flat at first: a field whose surface is a centimetre off must not draw this one towards it.
         along = np.maximum(distance[:, 0] ** 2 - plane**2, 0.0)
@@ -52,24 +58,32 @@ class SeenSurface:
         result[near] += say * (plane - result[near])
         return result
 
+    def screened(self, field: Grid, half: float, length: float) -> Grid:
+        """The field on a cube's grid, its sides near what was seen put right; `length`: how far that reaches."""
+        area = areas(self.tree, self.normal, NEIGHBOURS)
+        return screened(field, half, np.asarray(self.tree.data), self.normal, area, length)
+
 
 def some_of(points: Points) -> Points:
     """At most `MOST` of the points, at even steps."""
     return points[np.linspace(0, len(points) - 1, min(len(points), MOST)).astype(int)]
 
 
-def seen_surface(points: Points, slope: Points, reach: float) -> SeenSurface | None:
-    """Planes through each point's neighbours, outward where the field rises. None if there are too few points.
+def seen_surface(points: Points, slope: Points, reach: float, lowest: float = -np.inf) -> SeenSurface | None:
+    """Planes through each point's neighbours, outward. None if there are too few points.
 
-    `slope` is the field's gradient at the points; both in canonical units, relative to the object's centre.
+    `slope` is the field's gradient at the points, which has a say in what is outward; both in canonical units,
+    relative to the object's centre. Below the height `lowest` there is no free space.
     """
     if len(points) < FEWEST:
         return None
     tree = KDTree(points)
-    apart, neighbours = tree.query(points, k=NEIGHBOURS)
+    apart, neighbours = tree.query(points, k=NEIGHBOURS, workers=-1)
     center = points[neighbours].mean(axis=1)
     offset = points[neighbours] - center[:, None]
     normal = np.linalg.eigh(np.einsum("nki,nkj->nij", offset, offset))[1][:, :, 0]
-    outward = np.einsum("ni,nki->n", normal, slope[neighbours])
+    around = slope[neighbours].sum(axis=1)
+    rise = np.einsum("ni,ni->n", normal, around) / np.maximum(np.linalg.norm(around, axis=1), 1e-9)
     gap = GAP * max(float(np.median(apart[:, 1])), LEAST_GAP)
-    return SeenSurface(tree, center, np.where(outward < 0, -1.0, 1.0)[:, None] * normal, reach, gap)
+    signs = outward_signs(tree, normal, rise, gap, lowest)
+    return SeenSurface(tree, center, signs[:, None] * normal, reach, gap)

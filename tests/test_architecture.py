@@ -35,6 +35,8 @@ LAYERS = {
         "surface_registration",
         "evidence",
         "registration",
+        "orientation",
+        "screened_poisson",
         "seen_surface",
         "meshing",
         "joint",

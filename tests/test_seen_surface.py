@@ -66,7 +66,9 @@ def test_the_mesh_runs_through_what_was_seen_and_follows_the_field_elsewhere(bal
     radius, height = np.linalg.norm(p, axis=1), p[:, 2]
     # Where nothing was seen the ball goes on; between the two there is a step, which is what the reach blurs.
     np.testing.assert_allclose(radius[height < -0.1], 0.36, atol=0.005)
-    assert abs(np.median(radius[height > 0.1]) - 0.4) < 0.004 and radius[height > 0.1].max() < 0.42
+    assert abs(np.median(radius[height > 0.1]) - 0.4) < 0.004 and radius[height > 0.1].max() < 0.4 + 5 * (
+        noise + 0.002
+    )
     found = trimesh.Trimesh(p, mesh.faces, process=False).sample(20_000, seed=0)
     assert cKDTree(found).query(upper)[0].max() < 0.03
     alone = extract_mesh(tiny_prior, PIECE, MeshingConfig(coarse=16, resolution=64), seen=in_scan(seen))
@@ -92,12 +94,20 @@ def test_on_a_plane_the_distance_is_the_offset_and_far_away_the_field():
     assert say[1] > 0.9 and found[3] == 0.7
 
 
-def test_the_field_says_which_side_is_inside():
+def test_of_an_open_sheet_the_field_says_which_side_is_inside():
+    rng = np.random.default_rng(0)
+    points = np.column_stack([rng.uniform(-0.4, 0.4, (2000, 2)), np.zeros(2000)])
+    up = np.tile([0.0, 0.0, 1.0], (2000, 1))
+    queries, far = rng.uniform(-0.3, 0.3, (200, 3)) * [1, 1, 0.03], np.zeros(200)
+    out, inward = (seen_surface(points, s * up, REACH).corrected(queries, far) for s in (1, -1))
+    np.testing.assert_allclose(out, -inward, atol=1e-12)
+    assert (np.sign(out) == np.sign(queries[:, 2])).all()
+
+
+def test_of_a_closed_body_the_points_say_it_whatever_the_field_does():
     points, queries = sphere(2000, 0.3), sphere(200, 0.31, seed=5)
-    out, inward = (seen_surface(points, s * points, REACH) for s in (1, -1))
-    far = np.zeros(200)
-    np.testing.assert_allclose(out.corrected(queries, far), -inward.corrected(queries, far), atol=1e-12)
-    assert (out.corrected(queries, far) > 0).all()
+    for field in (1.0, -1.0):
+        assert (seen_surface(points, field * points, REACH).corrected(queries, np.zeros(200)) > 0).all()
 
 
 def test_turning_everything_changes_nothing():
