@@ -102,6 +102,7 @@ class RegistrationConfig:
     polish_points: int = 512  # then, for the best pose alone
     polish_steps: int = 10
     polish_reach: float = 0.02
+    field_weight: float = 0.0  # of both clouds' distance from the other's field, in the choice among poses
     truncation: float = 0.1  # a point farther than this from the other cloud counts as this far
 
 
@@ -229,6 +230,7 @@ def preset(name: str, *, upright: bool = False) -> SceneConfig:
                 refine="surface",
                 lift_weight=0.1,
                 truncation=0.2,
+                field_weight=2.0,
             ),
             meshing=MeshingConfig(
                 coarse=16,

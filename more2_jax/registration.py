@@ -104,7 +104,7 @@ def register_one(prior: Prior, pair: Pair, config: RegistrationConfig, upright: 
     pair = rescale(pair, 1 / radius)
     starts = candidate_poses(pair, config, upright)
     if config.refine == "surface":
-        return in_metres(register_surfaces(starts, pair, config, upright), radius)
+        return in_metres(register_surfaces(prior, starts, pair, config, upright), radius)
     starts = keep_best(starts, pair, config)
     refined = jax.vmap(lambda T: refine(prior, T, pair, config))(starts)
     if config.identity_start:

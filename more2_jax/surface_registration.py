@@ -2,7 +2,8 @@
 
 Beyond the paper (`RegistrationConfig.refine` "surface"): point-to-plane alignment both ways takes the place of the
 descent on the field, and poses are compared by the share of both clouds that finds its like, not by a residual that
-the unseen spoils.
+the unseen spoils. What has no like in the other cloud may still lie on the surface that the prior completes it with:
+poses that fit about as well are told apart by that.
 """
 
 from __future__ import annotations
@@ -26,9 +27,10 @@ from more2_jax.alignment import (
     whole_surface,
 )
 from more2_jax.config import RegistrationConfig
-from more2_jax.geometry import FAR, move, two_way_rms
+from more2_jax.geometry import FAR, Sampled, move, two_way_rms
+from more2_jax.prior import Prior, field_sdf, object_field
 from more2_jax.starts import Pair
-from more2_jax.types import Registration
+from more2_jax.types import Embedding, Registration
 
 STILL = 1e-2  # a last step below this (radians, and shares of the radius) has settled
 # How much worse "it did not move" may fit and still be chosen; so much worse, another pose still competes.
@@ -37,11 +39,12 @@ FINE = 0.25  # share of the truncation: the nearer one by which refined poses ar
 POINT_SHARE = 0.4  # of the distance to the nearest point, in a misfit; the rest is that off its surface
 TURNED_DEG = 15.0  # competing poses differ by more
 APART_DEG = 25.0  # poses kept for refinement differ by at least this
+OFF_FIELD = 0.1  # canonical units: farther than this from the other's completed surface is this far
 LIFTED = 0.1  # shares of the radius: an object lifted by this costs all of `lift_weight`
 
 
 def register_surfaces(
-    starts: jaxlie.SE3, pair: Pair, config: RegistrationConfig, upright: bool
+    prior: Prior, starts: jaxlie.SE3, pair: Pair, config: RegistrationConfig, upright: bool
 ) -> Registration:
     """The best pose of all starts, its covariance, and the poses that explain the clouds as well.
 
@@ -62,6 +65,8 @@ def register_surfaces(
         poses = join(poses, stayed)  # also exactly as it is
     misfits = jax.vmap(lambda T: misfit(T, source, target, truncations))(poses)
     costs = misfits + lifted(poses, pair.offset, config, upright)
+    if config.field_weight:
+        costs += config.field_weight * off_fields(prior, poses, pair, whole, config.sdf_points)
     best = choose(costs, config.identity_start)
     T = polished(jax.tree.map(lambda x: x[best], poses), whole, misfits[best], config, upright)
     if config.identity_start:  # what stayed is exactly where it was
@@ -111,6 +116,28 @@ def lifted(
     height = jnp.abs(poses.translation()[:, 2] - offset[2])
     weight = config.lift_weight if upright and config.identity_start else 0.0
     return weight * jnp.minimum(height / LIFTED, 1.0)
+
+
+def off_fields(
+    prior: Prior, poses: jaxlie.SE3, pair: Pair, whole: Sequence[Surface], count: int
+) -> Float[Array, " k"]:
+    """Of every pose, how far both clouds lie from the surface that the prior gives the other: 0 on it, 1 `OFF_FIELD`.
+
+    `count` points of each cloud are asked about. A pose that is not finite has 1.
+    """
+    source, target = (thinned(s, count).sampled for s in whole)
+
+    def one_way(T: jaxlie.SE3, cloud: Sampled, code: Embedding) -> Float[Array, ""]:
+        distance = jnp.abs(field_sdf(prior, object_field(prior, code), T @ cloud.points))
+        share = jnp.where(cloud.mask, jnp.minimum(distance / OFF_FIELD, 1.0), 0.0)
+        mean = share.sum() / jnp.maximum(cloud.mask.sum(), 1)
+        return jnp.where(jnp.isfinite(mean), mean, 1.0)
+
+    def both_ways(T: jaxlie.SE3) -> Float[Array, ""]:
+        there = one_way(T, source, pair.target_code)
+        return (there + one_way(T.inverse(), target, pair.source_code)) / 2
+
+    return jax.vmap(both_ways)(poses)
 
 
 def lowest_apart(cost: Float[Array, " n"], rotation: jaxlie.SO3, count: int) -> Int[Array, " count"]:
