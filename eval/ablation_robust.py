@@ -52,15 +52,18 @@ def main(
 
 
 def variants(robust: RegistrationConfig) -> dict[str, RegistrationConfig]:
-    """Registration by surfaces, and it without or with one thing."""
+    """Registration as `robust` has it, and without or with one thing."""
     changes = {
-        "surfaces": {},
-        "descent on the field": {"refine": "descent", "keep_starts": 3, "steps": 25, "learning_rate": 0.01},
-        "no polish": {"polish_steps": 0},
+        "robust": {},
+        "without the prior's surfaces": {"field_weight": 0.0},
+        "without polish": {"polish_steps": 0},
+        "without 'it did not move'": {"identity_start": False},
         "height is free": {"lift_weight": 0.0},
         "truncation halved": {"truncation": robust.truncation / 2},
         "3 starts kept": {"keep_starts": 3},
         "12 turns to start from": {"yaw_starts": 12},
+        "from the embedding's turn alone": {"starts": "embedding"},
+        "descent on the field": {"refine": "descent", "keep_starts": 3, "steps": 25, "learning_rate": 0.01},
     }
     return {name: dataclasses.replace(robust, **change) for name, change in changes.items()}
 
