@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jaxtyping import Bool, Float
-from scipy.ndimage import binary_dilation, zoom
+from scipy.ndimage import binary_dilation
 from skimage.measure import marching_cubes
 
 from more2_jax.config import MeshingConfig
@@ -147,9 +147,7 @@ def _refine(
     """
     cells = 2 * (len(values) - 1)
     near = near_surface(values, 2 * half / (len(values) - 1))
-    field, values = (
-        np.asarray(zoom(x, (cells + 1) / len(x), order=1, grid_mode=False)) for x in (field, values)
-    )
+    field, values = doubled(field), doubled(values)
     fine = np.zeros([cells + 1] * 3, bool)
     corners = 2 * np.argwhere(near)
     for step in itertools.product(range(3), repeat=3):
@@ -167,11 +165,23 @@ def _sided(
 ) -> tuple[Float[np.ndarray, "m m m"], Float[np.ndarray, "m m m"]]:
     """Field and values on the grid with half the step: inside and outside as what was seen has them, near it."""
     cells = 2 * (len(field) - 1)
-    finer = np.asarray(zoom(field, (cells + 1) / len(field), order=1, grid_mode=False))
-    queries = _grid(cells, half)
+    finer, queries = doubled(field), _grid(cells, half)
     finer = np.maximum(finer.ravel(), lowest - queries[:, 2]).reshape(finer.shape)
     field = through.screened(finer, half, screening)
     return field, _drawn(through, lowest, queries, field.ravel()).reshape(field.shape)
+
+
+def doubled(x: Float[np.ndarray, "n n n"]) -> Float[np.ndarray, "m m m"]:
+    """Linear interpolation to half the step: `scipy.ndimage.zoom`, which takes eight times as long."""
+    for axis in (2, 1, 0):
+        shape = list(x.shape)
+        shape[axis] = 2 * shape[axis] - 1
+        finer = np.empty(shape, x.dtype)
+        old, new = np.moveaxis(x, axis, 0), np.moveaxis(finer, axis, 0)  # views
+        new[::2] = old
+        new[1::2] = (old[:-1] + old[1:]) / 2
+        x = finer
+    return x
 
 
 def near_surface(values: Float[np.ndarray, "n n n"], cell: float) -> Bool[np.ndarray, "c c c"]:
