@@ -131,7 +131,7 @@ def jax_jobs(model: PriorConfig, batch: tuple[Array, Array, Array], plain: bool)
 
     def loss(params: Any, points: Array, queries: Array, truth: Array) -> Array:
         p = dataclasses.replace(prior, params=params)
-        found = over(lambda row: distances(p, *row, plain), (points, queries))
+        found = over(lambda row: distances(p, row[0], row[1], plain), (points, queries))
         return jnp.abs(found - truth).mean()
 
     def step(params: Any, state: Any, *batch: Array) -> Any:
