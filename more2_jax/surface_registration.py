@@ -40,6 +40,7 @@ POINT_SHARE = 0.4  # of the distance to the nearest point, in a misfit; the rest
 TURNED_DEG = 15.0  # competing poses differ by more
 APART_DEG = 25.0  # poses kept for refinement differ by at least this
 OFF_FIELD = 0.1  # canonical units: farther than this from the other's completed surface is this far
+ABOUT_AS_WELL = 0.2  # of misfit: poses that fit worse than the best by more are not the prior's to choose
 LIFTED = 0.1  # shares of the radius: an object lifted by this costs all of `lift_weight`
 
 
@@ -54,8 +55,7 @@ def register_surfaces(
     coarse = [coarse_of(s, config) for s in whole]
     starts, _ = search(starts, coarse[0], coarse[1], pair.offset, config, upright)
     source, target = (thinned(s, config.surface_points) for s in whole)
-    stayed = jaxlie.SE3.from_rotation_and_translation(jaxlie.SO3.identity(), pair.offset)
-    stayed = jax.tree.map(lambda x: x[None], stayed)
+    stayed = jax.tree.map(lambda x: x[None], jaxlie.SE3.from_translation(pair.offset))
     if config.identity_start:
         starts = join(starts, stayed)
     reach = (config.first_reach, config.last_reach)
@@ -65,25 +65,23 @@ def register_surfaces(
         poses = join(poses, stayed)  # also exactly as it is
     misfits = jax.vmap(lambda T: misfit(T, source, target, truncations))(poses)
     costs = misfits + lifted(poses, pair.offset, config, upright)
-    if config.field_weight:
-        costs += config.field_weight * off_fields(prior, poses, pair, whole, config.sdf_points)
-    best = choose(costs, config.identity_start)
+    doubt = doubts(prior, poses, costs, pair, whole, config)
+    best = choose(costs, config.identity_start, doubt)
     T = polished(jax.tree.map(lambda x: x[best], poses), whole, misfits[best], config, upright)
     if config.identity_start:  # what stayed is exactly where it was
         T = jax.tree.map(lambda x, y: jnp.where(best == len(misfits) - 1, y[0], x), T, stayed)
     rms = two_way_rms(move(T, source.sampled), target.sampled, config.trim)
     last = align_step(T, source, target, jnp.asarray(config.last_reach), upright)
     still = jnp.linalg.norm((last @ T.inverse()).log()) < STILL
-    rms = jnp.where(jnp.isfinite(rms), rms, jnp.inf)
     return Registration(
         T_target_source=T,
         loss=misfits[best],
-        rms_m=rms,
+        rms_m=jnp.where(jnp.isfinite(rms), rms, jnp.inf),
         converged=still & (rms < config.converged_rms),
         misfit=misfits[best],
         covariance=pose_covariance(T, source, target, config.last_reach, upright),
         competing=poses,
-        competes=competing(poses, costs, best),
+        competes=competing(poses, costs + doubt, best),
     )
 
 
@@ -116,6 +114,21 @@ def lifted(
     height = jnp.abs(poses.translation()[:, 2] - offset[2])
     weight = config.lift_weight if upright and config.identity_start else 0.0
     return weight * jnp.minimum(height / LIFTED, 1.0)
+
+
+def doubts(
+    prior: Prior,
+    poses: jaxlie.SE3,
+    costs: Float[Array, " k"],
+    pair: Pair,
+    whole: Sequence[Surface],
+    config: RegistrationConfig,
+) -> Float[Array, " k"]:
+    """What the prior adds to the costs of poses: it tells those apart that fit about as well, and has no say beyond."""
+    if not config.field_weight:
+        return jnp.zeros_like(costs)
+    off = off_fields(prior, poses, pair, whole, config.sdf_points)
+    return config.field_weight * jnp.where(costs <= costs.min() + ABOUT_AS_WELL, off, 1.0)
 
 
 def off_fields(
@@ -209,11 +222,11 @@ def misfits_both_ways(
     return mean(shares[:count], real[:count]), mean(shares[count:], real[count:])
 
 
-def choose(misfits: Float[Array, " k"], stayed_is_last: bool) -> Array:
-    """The pose with the least misfit; "it did not move" (the last) if nearly as good: the simplest explanation."""
+def choose(costs: Float[Array, " k"], stayed_is_last: bool, doubt: Float[Array, " k"] | float = 0.0) -> Array:
+    """The pose that costs least; "it did not move" (the last) if it fits nearly as well: the simplest explanation."""
     if stayed_is_last:
-        misfits = misfits.at[-1].set((misfits[-1] - STAYED_OFFSET) / STAYED_RATIO)
-    return jnp.argmin(misfits)
+        costs = costs.at[-1].set((costs[-1] - STAYED_OFFSET) / STAYED_RATIO)
+    return jnp.argmin(costs + doubt)
 
 
 def competing(poses: jaxlie.SE3, misfits: Float[Array, " k"], best: Array) -> Bool[Array, " k"]:

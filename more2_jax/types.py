@@ -90,7 +90,7 @@ class Registration:
     rms_m: Float[Array, "*batch"]  # trimmed root mean square of nearest distances, both ways
     converged: Bool[Array, "*batch"]  # the pose stopped moving and explains both clouds
     # The rest only where `RegistrationConfig.refine` is "surface".
-    misfit: Float[Array, "*batch"] | None = None  # chosen by: 0 none, 1 nothing of both clouds agrees
+    misfit: Float[Array, "*batch"] | None = None  # of the surfaces: 0 none, 1 nothing of both clouds agrees
     covariance: Float[Array, "*batch 6 6"] | None = (
         None  # of (shift m, turn rad), about the target's local zero
     )

@@ -16,7 +16,7 @@ from more2_jax.config import preset
 from more2_jax.geometry import Sampled
 from more2_jax.prior import encode, load_prior, sdf_one
 from more2_jax.starts import Pair
-from more2_jax.surface_registration import OFF_FIELD, off_fields
+from more2_jax.surface_registration import ABOUT_AS_WELL, OFF_FIELD, doubts, off_fields
 
 POINTS, COUNT = 512, 64
 CONFIG = preset("robust", upright=True).registration
@@ -90,6 +90,19 @@ def test_moving_the_target_moves_the_pose_alone(prior, example):
     here = off_fields(prior, poses_of(np.eye(4)), *pair_of(prior, source, target), POINTS)
     there = off_fields(prior, poses_of(shift @ M @ np.linalg.inv(shift)), *moved, POINTS)
     np.testing.assert_allclose(there, here, atol=5e-3)
+
+
+def test_it_chooses_among_poses_that_fit_about_as_well_and_no_others(prior, example):
+    half = pieces.pose(Rotation.from_euler("z", 180, degrees=True), np.zeros(3))
+    poses = poses_of(half, np.eye(4), np.eye(4))
+    costs = jnp.array([0.2, 0.2 + 0.9 * ABOUT_AS_WELL, 0.2 + 1.1 * ABOUT_AS_WELL])
+    found = doubts(prior, poses, costs, *example, CONFIG) / CONFIG.field_weight
+    np.testing.assert_allclose(
+        found[:2], off_fields(prior, poses, *example, CONFIG.sdf_points)[:2], rtol=1e-6
+    )
+    assert found[2] == 1
+    without = dataclasses.replace(CONFIG, field_weight=0.0)
+    assert not doubts(prior, poses, costs, *example, without).any()
 
 
 def test_only_robust_asks_for_it():
