@@ -1,7 +1,9 @@
 """How fast encoder and training step are beside plain forms of the same layers: `python -m eval.speed`.
 
 Ratios from one run: ours, the plain form in JAX, and the published layers' operations in PyTorch if an interpreter
-that has it is named. All get the same sizes, clouds and cores, and clouds in farthest-point order.
+that has it is named. All get the same sizes, clouds and cores, and clouds in farthest-point order. Whatever has a
+gradient, ours does as `train.prior` does: on CPUs every core has its share of the clouds, one after the other, and
+gradients are added up. The others get all clouds at once, and their libraries divide every operation over the cores.
 """
 
 from __future__ import annotations
@@ -30,6 +32,7 @@ from more2_jax.geometry import farthest_points
 from more2_jax.in_turn import in_turn
 from more2_jax.losses import AT_ONCE
 from more2_jax.prior import Prior, encode_ordered, init_prior
+from train.devices import by_rows, cores, device_a_core, device_mesh, everywhere
 from train.memory import GLIBC_KEEPS_MEMORY, keep_freed_memory
 from train.program import run
 
@@ -57,7 +60,8 @@ def main(
         queries: a cloud, in the training step: encoder, decoder, mean error, gradient, Adam. No dropout.
         repeats: rounds; every competitor once a round.
     """
-    keep_freed_memory()  # as training does
+    keep_freed_memory()  # as training does, and so is
+    device_a_core(clouds)
     quiet = published_layers(load_config(config, TrainingRun).model)
     batch = clouds_and_queries(clouds, points, queries)
     jobs = {
@@ -69,7 +73,7 @@ def main(
         flat = interleaved({"/".join(key): job for key, job in jobs.items()}, repeats)
     rows = table({tuple(key.split("/")): s for key, s in flat.items()})
     said = {"clouds": clouds, "points": points, "queries": queries, "repeats": repeats}
-    said |= {"config": config.name, "cores": len(os.sched_getaffinity(0)), "torch": version, "rows": rows}
+    said |= {"config": config.name, "cores": cores(), "torch": version, "rows": rows}
     if out is not None:
         out.write_text(json.dumps(said, indent=1) + "\n")
 
@@ -115,35 +119,41 @@ def distances(prior: Prior, points: Array, queries: Array, plain: bool) -> Array
 def jax_jobs(model: PriorConfig, batch: tuple[Array, Array, Array], plain: bool) -> dict[str, Job]:
     """The three jobs, compiled."""
     prior, adam = init_prior(model, jax.random.key(0)), optax.adam(1e-4)
+    mesh = device_mesh(len(batch[0]))
 
     # Everything is an argument: of constants the compiler would compute a part in advance.
     def forward(params: Any, points: Array) -> plain_layers.Outputs:
         p = dataclasses.replace(prior, params=params)
         return jax.vmap(lambda x: outputs(p, x, plain))(points)
 
-    def over(one: Any, rows: Any) -> Any:  # ours as training does it
-        return jax.vmap(one)(rows) if plain else in_turn(one, rows, max(1, AT_ONCE // batch[0].shape[1]))
+    def over(one: Any, params: Any, rows: Any) -> Any:  # ours as training does it
+        f = lambda params, row: one(dataclasses.replace(prior, params=params), row)  # noqa: E731
+        if plain:
+            return jax.vmap(f, in_axes=(None, 0))(params, rows)
+        return in_turn(f, params, rows, max(1, AT_ONCE // batch[0].shape[1]), mesh)
 
     def squares(params: Any, points: Array) -> Array:
-        p = dataclasses.replace(prior, params=params)
-        found = over(lambda x: outputs(p, x, plain), points)
+        found = over(lambda p, x: outputs(p, x, plain), params, points)
         return sum((jnp.sum(x**2) for x in found), jnp.zeros(()))
 
     def loss(params: Any, points: Array, queries: Array, truth: Array) -> Array:
-        p = dataclasses.replace(prior, params=params)
-        found = over(lambda row: distances(p, row[0], row[1], plain), (points, queries))
+        found = over(lambda p, row: distances(p, row[0], row[1], plain), params, (points, queries))
         return jnp.abs(found - truth).mean()
 
     def step(params: Any, state: Any, *batch: Array) -> Any:
         updates, state = adam.update(jax.grad(loss)(params, *batch), state)
         return optax.apply_updates(params, updates), state
 
-    state = adam.init(prior.params)
+    weights = prior.params, adam.init(prior.params)
+    if plain:
+        params, state, split = *weights, batch
+    else:
+        (params, state), split = everywhere(mesh, weights), jax.device_put(batch, by_rows(mesh))
     run_forward, run_gradient, run_step = jax.jit(forward), jax.jit(jax.grad(squares)), jax.jit(step)
     return {
         "forward": timed(lambda: run_forward(prior.params, batch[0])),
-        "encoder_step": timed(lambda: run_gradient(prior.params, batch[0])),
-        "step": timed(lambda: run_step(prior.params, state, *batch)),
+        "encoder_step": timed(lambda: run_gradient(params, split[0])),
+        "step": timed(lambda: run_step(params, state, *split)),
     }
 
 
@@ -167,7 +177,7 @@ def torch_jobs(
         names = ("hidden", "layers", "skip", "narrow")
         d = model.decoder
         settings = {
-            "threads": len(os.sched_getaffinity(0)),
+            "threads": cores(),
             "encoder": dataclasses.asdict(model.encoder),
             "decoder": dict(zip(names, (d.hidden, d.layers, d.skip_layer, d.narrow_skip), strict=True)),
             **{k: np.asarray(x).tolist() for k, x in zip(("points", "queries", "sdf"), batch, strict=True)},

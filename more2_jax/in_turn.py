@@ -1,4 +1,4 @@
-"""A function of every row of a batch, a few rows at a time where that keeps their arrays in a CPU's caches."""
+"""A function of every row of a batch: each device its share, on CPUs a few rows at a time to stay in the caches."""
 
 from __future__ import annotations
 
@@ -6,18 +6,29 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
+from jax.sharding import Mesh, PartitionSpec
 
-Tree = Any  # of arrays, with a leading axis of rows
+Tree = Any  # of arrays
 
 
-def in_turn(one: Callable[[Tree], Tree], rows: Tree, at_once: int, devices: int = 1) -> Tree:
-    """`jax.vmap(one)(rows)`; on CPUs `at_once` rows after the other, on each of `devices` that share the rows evenly.
+def in_turn(
+    one: Callable[[Tree, Tree], Tree], shared: Tree, rows: Tree, at_once: int, mesh: Mesh | None = None
+) -> Tree:
+    """`one(shared, row)` of every row along the leading axis of `rows`, each device of `mesh` having its share.
 
-    Where a whole batch's features outgrow the second-level cache, every pass over them waits for main memory.
-    Accelerators have use for all rows together.
+    On CPUs `at_once` rows after the other: where a whole batch's features outgrow the second-level cache, every pass
+    over them waits for main memory. Accelerators have use for all rows together. What a gradient is asked for stands
+    in `shared` or `rows`, not in `one`. ValueError where the devices cannot share the rows evenly.
     """
-    if jax.default_backend() != "cpu":
-        return jax.vmap(one)(rows)
-    shares = jax.tree.map(lambda x: x.reshape(devices, -1, *x.shape[1:]), rows)
-    found = jax.vmap(lambda share: jax.lax.map(one, share, batch_size=at_once))(shares)
-    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), found)
+
+    def some(shared: Tree, rows: Tree) -> Tree:
+        if jax.default_backend() != "cpu":
+            return jax.vmap(one, in_axes=(None, 0))(shared, rows)
+        return jax.lax.map(lambda row: one(shared, row), rows, batch_size=at_once)
+
+    if mesh is None or mesh.size == 1:
+        return some(shared, rows)
+    # Said outright: left to itself, the compiler has every device look for the neighbours of all rows.
+    whole, split = PartitionSpec(), PartitionSpec(mesh.axis_names)
+    share = jax.shard_map(some, mesh=mesh, in_specs=(whole, split), out_specs=split, check_vma=False)
+    return share(shared, rows)

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import optax
 from jax import Array
+from jax.sharding import Mesh
 from jaxtyping import Float
 
 from more2_jax.config import TrainingConfig
@@ -74,13 +78,17 @@ def rotation_loss(eqv: Float[Array, "b 2 3 c"]) -> Float[Array, ""]:
 
 
 def total_loss(
-    prior: Prior, sample: TrainingSample, config: TrainingConfig, dropout_key: Array, devices: int = 1
+    prior: Prior,
+    sample: TrainingSample,
+    config: TrainingConfig,
+    dropout_key: Array,
+    mesh: Mesh | None = None,
 ) -> tuple[Float[Array, ""], dict[str, Float[Array, ""]]]:
     """The training loss of a batch and its terms; shapes are canonical, so F_c → 0 and F_s → 1.
 
-    `devices`: how many share the batch.
+    `mesh`: the devices that share the batch.
     """
-    embedding, predicted = predict(prior, sample, dropout_key, train=True, devices=devices)
+    embedding, predicted = predict(prior, sample, dropout_key, train=True, mesh=mesh)
     terms = {
         "sdf": sdf_loss(predicted, sample.sdf, config.near_surface),
         "center": jnp.mean(jnp.linalg.norm(embedding.center - sample.center + 1e-12, axis=-1)),
@@ -107,18 +115,19 @@ def total_loss(
 
 
 def predict(
-    prior: Prior, sample: TrainingSample, dropout_key: Array, train: bool, devices: int = 1
+    prior: Prior, sample: TrainingSample, dropout_key: Array, train: bool, mesh: Mesh | None = None
 ) -> tuple[Embedding, Float[Array, "b 2 q"]]:
     """Encodes both clouds of every shape and decodes the queries with each cloud's own code."""
-    decoder, weights = Decoder(prior.config), {"params": prior.params["decoder"]}
+    decoder = Decoder(prior.config)
 
-    def one(cloud: tuple[Array, Array, Array, Array]) -> tuple[Embedding, Array]:
+    def one(params: dict[str, Any], cloud: tuple[Array, Array, Array, Array]) -> tuple[Embedding, Array]:
         points, mask, queries, key = cloud
-        e = encode_ordered(prior, points, mask)
+        e = encode_ordered(dataclasses.replace(prior, params=params), points, mask)
+        weights = {"params": params["decoder"]}
         return e, decoder.apply(weights, e, queries, train, rngs={"dropout": key})  # type: ignore[return-value]
 
     keys = jax.random.split(dropout_key, sample.sdf.shape[:2])
     by_shape = (sample.points, sample.mask, sample.queries, keys)
     clouds = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), by_shape)
-    found = in_turn(one, clouds, max(1, AT_ONCE // sample.points.shape[2]), devices)
+    found = in_turn(one, prior.params, clouds, max(1, AT_ONCE // sample.points.shape[2]), mesh)
     return jax.tree.map(lambda x: x.reshape(-1, 2, *x.shape[1:]), found)

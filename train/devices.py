@@ -1,8 +1,12 @@
-"""One program on all devices of all hosts: batches are split by rows, everything else is on every device."""
+"""One program on all devices of all hosts: batches are split by rows, everything else is on every device.
+
+On CPUs a device is a core: most loops of a step run on one thread, so cores share rows better than loops.
+"""
 
 from __future__ import annotations
 
 import os
+from contextlib import suppress
 from typing import TypeVar
 
 import jax
@@ -13,6 +17,34 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 T = TypeVar("T")
 ROWS = "rows"  # of a batch: the one axis of the mesh
 IN_ENVIRONMENT = ("JAX_COORDINATOR_ADDRESS", "COORDINATOR_ADDRESS")
+CHOSEN_BY_FLAG = "xla_force_host_platform_device_count"
+
+
+def shares(batch: int, cores: int) -> int:
+    """The most devices, one a core at most, that share the rows of a batch evenly."""
+    return max(n for n in range(1, min(batch, cores) + 1) if batch % n == 0)
+
+
+def device_a_core(batch: int, coordinator: str = "") -> None:
+    """Divides the CPU into devices that share `batch`; before anything else asks JAX for a device.
+
+    Programs on accelerators do not run there. Nothing changes for a process among several, which may share their
+    cores; where XLA_FLAGS or JAX_NUM_CPU_DEVICES have chosen; and where JAX has its devices already.
+    """
+    among_several = coordinator or any(os.environ.get(name) for name in IN_ENVIRONMENT)
+    if not (among_several or chosen_by_user()):
+        with suppress(RuntimeError):  # what JAX says when it is too late
+            jax.config.update("jax_num_cpu_devices", shares(batch, cores()))
+
+
+def chosen_by_user() -> bool:
+    """Whether the environment says how many devices a CPU is."""
+    return "JAX_NUM_CPU_DEVICES" in os.environ or CHOSEN_BY_FLAG in os.environ.get("XLA_FLAGS", "")
+
+
+def cores() -> int:
+    """That this process may use; on systems that do not tell, all there are."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def connect(coordinator: str, processes: int, process: int) -> None:
@@ -72,6 +104,12 @@ def everywhere(mesh: Mesh, tree: T) -> T:
         return jax.make_array_from_callback(host.shape, sharding, lambda part: host[part])
 
     return jax.tree.map(put, tree)
+
+
+def to_read(mesh: Mesh, tree: T) -> T:
+    """As `everywhere`, for what is gigabytes and never written: the devices of a CPU look at the same memory."""
+    cpu = mesh.devices.flat[0].platform == "cpu"
+    return everywhere(mesh, jax.tree.map(np.asarray, tree) if cpu else tree)
 
 
 def here(tree: T) -> T:

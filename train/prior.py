@@ -1,7 +1,8 @@
 """Trains the prior: `python -m train.prior --config configs/small.yaml --shards data/shards --out runs/small`.
 
 Resumes from the newest checkpoint in `--out`, as if it had never stopped; ends after `--minutes`, leaving
-checkpoint and weights. Runs on all devices; on several hosts, started once on each with `--coordinator`.
+checkpoint and weights. Runs on all devices, on a CPU on all cores; on several hosts, started once on each with
+`--coordinator`.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ from more2_jax.data.sampling import sample_batch
 from more2_jax.data.shards import Shapes
 from more2_jax.prior import Prior, encode_ordered, init_prior, load_prior, save_prior
 from train.checkpoints import keep, open_checkpoints, resume
-from train.devices import agreed, connect, device_mesh, everywhere, here, is_first
+from train.devices import agreed, connect, device_a_core, device_mesh, everywhere, here, is_first, to_read
 from train.journal import Journal
 from train.memory import keep_freed_memory
 from train.pictures import held_out
@@ -82,15 +83,15 @@ def main(
     """
     deadline = time.monotonic() + 60 * minutes
     keep_freed_memory()
-    connect(coordinator, processes, process)
     settings, name = load_config(config, TrainingRun), name or config.stem
+    device_a_core(settings.training.batch, coordinator)
+    connect(coordinator, processes, process)
     first = started_warm(settings.model, warm_start, name) if warm_start else None
     setting = prepared(settings, shards, out, deadline, name, first)
     out.mkdir(parents=True, exist_ok=True)
     with open_checkpoints(out / "checkpoints") as manager:
         state = everywhere(setting.mesh, initial_state(setting.prior, setting.training))
-        state, step = resume(manager, state)
-        state = train_until(setting, state, step, manager)
+        state = train_until(setting, *resume(manager, state), manager)
         manager.wait_until_finished()
     if is_first():
         save_prior(averaged(setting, state), out / "weights.npz")
@@ -113,7 +114,7 @@ def prepared(
         training=training,
         prior=warm or started_cold(settings, train, name),
         mesh=mesh,
-        train=everywhere(mesh, train),
+        train=to_read(mesh, train),
         rows=everywhere(mesh, jnp.asarray(rows)),
         val=val,
         out=out,

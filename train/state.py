@@ -81,7 +81,7 @@ def training_step(
 
     def loss(params: dict[str, Any]) -> tuple[Array, dict[str, Array]]:
         prior = Prior(params=params, config=model)
-        return total_loss(prior, sample, config, dropout_key, mesh.size)
+        return total_loss(prior, sample, config, dropout_key, mesh)
 
     gradient, terms = jax.grad(loss, has_aux=True)(state.params)
     updates, opt_state = optimiser(config).update(gradient, state.optimiser, state.params)
