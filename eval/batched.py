@@ -17,7 +17,8 @@ from more2_jax.config import RegistrationConfig
 from more2_jax.encoding import unstack, with_origin
 from more2_jax.prior import Prior, encode
 from more2_jax.registration import register, world_pose
-from more2_jax.types import Embedding, PointCloud
+from more2_jax.sight import padded_sights
+from more2_jax.types import Embedding, PointCloud, Sight
 
 Points = Float[np.ndarray, "_ 3"]
 Pose = Float[np.ndarray, "4 4"]
@@ -32,6 +33,8 @@ class PairToRegister:
     target: Points
     source_code: Embedding
     target_code: Embedding
+    source_sight: Sight | None = None
+    target_sight: Sight | None = None
 
 
 def over_devices(tree: Tree, batch: int) -> Tree:
@@ -73,7 +76,14 @@ def register_all(
             with_origin(stacked([getattr(p, k) for p in part], batch), np.asarray(cloud.origin))
             for k, cloud in (("source_code", source), ("target_code", target))
         )
-        found_here = register(prior, source, target, source_code, target_code, config, upright)
+        sights = {
+            f"{side}_sight": padded_sights(
+                [getattr(p, f"{side}_sight") for p in part], np.asarray(cloud.origin)
+            )
+            for side, cloud in (("source", source), ("target", target))
+        }
+        over = over_devices(sights, batch)
+        found_here = register(prior, source, target, source_code, target_code, config, upright, **over)
         result = jax.device_get(found_here)
         for n in range(len(part)):
             T = jax.tree.map(lambda x, n=n: jnp.asarray(x[n]), result.T_target_source)

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
+
 from eval.flyingshape import flyingshape
 from eval.threerscan import threerscan
-from eval.truth import Benchmark
+from eval.truth import Benchmark, KnownScene
 
 Masks = Literal["true", "merged", "split", "eroded", "wrong", "predicted"]
 
@@ -35,6 +37,8 @@ class Options:
     """true, damaged on purpose, or (3rscan) predicted: mask3d.labels.npz beside each scan."""
     upright: Literal["auto", "yes", "no"] = "auto"
     """Whether the method is told that objects only turn about the vertical; auto: as the data were made."""
+    sensors: bool = True
+    """Whether the method is told where the sensors of every scan stood, where the data say so. Peers never ask."""
     peers: bool = True
     """Also measure what one would use instead, on the same clouds."""
     chunk: int = 4
@@ -67,7 +71,13 @@ def benchmark(o: Options) -> Benchmark:
         raise ValueError(
             "predicted masks are read for 3rscan only; damaged ones are merged, split, eroded, wrong"
         )
-    return flyingshape(o.data)
+    data = flyingshape(o.data)
+    return data if o.sensors else replace(data, read=lambda name: without_sensors(data.read(name)))
+
+
+def without_sensors(scene: KnownScene) -> KnownScene:
+    """The scene as if nobody knew where its sensors stood."""
+    return replace(scene, scans=tuple(replace(s, sensors=np.zeros((0, 3))) for s in scene.scans))
 
 
 def is_upright(o: Options, data: Benchmark) -> bool:

@@ -27,6 +27,8 @@ from eval.runs import run_scenes, start_run
 from eval.truth import KnownObject, KnownScene
 from more2_jax.config import RegistrationConfig, preset
 from more2_jax.prior import Prior
+from more2_jax.sight import sight_of
+from more2_jax.types import Scan, Sight
 from train.program import run
 
 KABSCH = "Kabsch on F_eqv alone"  # a learned peer, as FreeReg: one look at the codes
@@ -55,6 +57,18 @@ class TruePair:
         return self.scene.instance(self.scan, o.instance[self.scan]).points, self.scene.instance(
             0, o.instance[0]
         ).points
+
+    def sights(self) -> tuple[Sight | None, Sight | None]:
+        """What the sensors of both scans saw around the object, where the data say how they stood."""
+        source, target = self.clouds
+        return sight_in(self.scene.scans[self.scan], source), sight_in(self.scene.scans[0], target)
+
+
+def sight_in(scan: Scan, cloud: np.ndarray) -> Sight | None:
+    """What a scan's sensors saw around one of its clouds."""
+    return sight_of(
+        cloud, np.concatenate([*(i.points for i in scan.instances), scan.background]), scan.sensors
+    )
 
 
 def figures(right_deg: float) -> list[Figure]:
@@ -105,13 +119,15 @@ def main(options: Annotated[Settings, tyro.conf.arg(name="")]) -> None:
 
 
 def own_settings(name: str, upright: bool) -> dict[str, RegistrationConfig]:
-    """The preset's registration, with and without what follows the coarse search of starts."""
+    """The preset's registration; without knowing the sensors; and without what follows the coarse search of starts."""
     config = preset(name, upright=upright).registration
     paper = preset("paper", upright=upright).registration
+    blind = dataclasses.replace(config, free_weight=0.0)
     return {
         f"ours, {name}": config,
+        **({f"ours, {name}, sensors unknown": blind} if config.free_weight else {}),
         f"ours, {name}, without optimisation": dataclasses.replace(
-            config, steps=0, surface_steps=0, polish_steps=0
+            blind, steps=0, surface_steps=0, polish_steps=0
         ),
         KABSCH: dataclasses.replace(paper, steps=0, icp_steps=0),
     }
@@ -142,8 +158,16 @@ def own_records(
     began = time.perf_counter()
     codes = embed_all(prior, [c for pair in clouds for c in pair], batch)
     encoding_s = (time.perf_counter() - began) / len(pairs)
+    sights = [p.sights() for p in pairs]
     ready = [
-        PairToRegister(source=s, target=t, source_code=codes[2 * k], target_code=codes[2 * k + 1])
+        PairToRegister(
+            source=s,
+            target=t,
+            source_code=codes[2 * k],
+            target_code=codes[2 * k + 1],
+            source_sight=sights[k][0],
+            target_sight=sights[k][1],
+        )
         for k, (s, t) in enumerate(clouds)
     ]
     found: list[tuple[str, Record]] = []

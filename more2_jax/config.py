@@ -103,6 +103,9 @@ class RegistrationConfig:
     polish_steps: int = 10
     polish_reach: float = 0.02
     field_weight: float = 0.0  # of both clouds' distance from the other's field, in the choice among poses
+    free_weight: float = (
+        0.0  # of both clouds' share in space that the other's sensors looked through, if known
+    )
     truncation: float = 0.1  # a point farther than this from the other cloud counts as this far
 
 
@@ -231,6 +234,7 @@ def preset(name: str, *, upright: bool = False) -> SceneConfig:
                 lift_weight=0.1,
                 truncation=0.2,
                 field_weight=2.0,
+                free_weight=8.0 if upright else 0.0,
             ),
             meshing=MeshingConfig(
                 coarse=16,

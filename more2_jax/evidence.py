@@ -92,7 +92,7 @@ def fit(
     pair = Pair(source=s.sampled, target=t.sampled, source_code=a, target_code=b, offset=offset / radius)
     starts = candidate_poses(pair, config, upright)
     config = dataclasses.replace(config, keep_starts=HYPOTHESES)
-    poses, _ = search(starts, s, t, pair.offset, config, upright)
+    poses, _ = search(starts, s, t, pair, config, upright)
     T = jax.tree.map(lambda x: x[0], poses)
     there, back = misfits_both_ways(T, s, t, (config.truncation,))
     lift = jnp.abs(T.translation()[2] - pair.offset[2]) * radius

@@ -28,6 +28,7 @@ from more2_jax.consensus import (
     with_errors,
 )
 from more2_jax.metrics import apply_pose
+from more2_jax.sight import moved_sight
 from more2_jax.types import Embedding, Frame, move_embedding
 from more2_jax.verification import Known, PairFits, assign, compared, fit_pairs, heights, proposal_of
 
@@ -66,7 +67,10 @@ def moved(known: Known, T_b_a: Pose) -> Known:
     if np.array_equal(T_b_a, np.eye(4)):
         return known
     embedding = moved_embedding(known.embedding, T_b_a)
-    return dataclasses.replace(known, points=apply_pose(T_b_a, known.points), embedding=embedding)
+    sight = None if known.sight is None else moved_sight(known.sight, T_b_a)
+    return dataclasses.replace(
+        known, points=apply_pose(T_b_a, known.points), embedding=embedding, sight=sight
+    )
 
 
 def lift(height_m: float) -> Pose:

@@ -195,6 +195,7 @@ def scene_to_json(scene: LivingScene) -> dict[str, Any]:
                 "source": s.source,
                 "instances": [int(i) for i in s.instances],
                 "skipped": [{"what": k.what, "reason": k.reason} for k in s.skipped],
+                "sensors": np.asarray(s.sensors, np.float64).tolist(),
                 "frame": {
                     "T_scene_scan": np.asarray(s.frame.T_scene_scan, np.float64).tolist(),
                     "sigma_m": float(s.frame.sigma_m),
@@ -278,6 +279,7 @@ def _scene(folder: Path, content: dict[str, Any]) -> LivingScene:
             "skipped": tuple(Skipped(**k) for k in s.get("skipped", [])),
             "background": background[owner == s["index"]],
             "frame": _frame(s.get("frame")),
+            "sensors": np.array(s.get("sensors", []), np.float64).reshape(-1, 3),
         }
         for s in content["scans"]
     ]

@@ -31,9 +31,10 @@ from more2_jax.geometry import (
     two_way_rms,
 )
 from more2_jax.prior import Prior, field_sdf, object_field
+from more2_jax.sight import scale_sight
 from more2_jax.starts import Pair, candidate_poses
 from more2_jax.surface_registration import lowest_apart, register_surfaces
-from more2_jax.types import Embedding, PointCloud, Registration, scale_embedding
+from more2_jax.types import Embedding, PointCloud, Registration, Sight, scale_embedding
 
 STILL = 1e-2  # a last ICP step below this (radians, and shares of the radius) has settled
 # How much worse "it did not move" may fit and still be chosen (the offset in shares of the radius).
@@ -48,9 +49,13 @@ def register(
     target_embedding: Embedding,
     config: RegistrationConfig,
     upright: bool = False,
+    *,
+    source_sight: Sight | None = None,
+    target_sight: Sight | None = None,
 ) -> Registration:
     """Registers a batch of pairs in one call: row i of `source` onto row i of `target` (paper §3.3).
 
+    Sights (`sight.padded_sights`, about the clouds' origins) say what sensors saw around each, where that is known.
     Returns local poses; `world_pose` makes them poses between the scans' frames. Raises ValueError when the
     batches differ in size.
     """
@@ -62,7 +67,8 @@ def register(
     zero = jnp.zeros_like(offset)
     codes = [dataclasses.replace(e, origin=zero) for e in (source_embedding, target_embedding)]
     clouds = (source.points, source.mask, target.points, target.mask)
-    return _register_many(prior, *clouds, *codes, offset, config, upright)
+    sights = (source_sight, target_sight)
+    return _register_many(prior, *clouds, *codes, offset, sights, config, upright)
 
 
 @partial(jax.jit, static_argnames=("config", "upright"))
@@ -75,13 +81,21 @@ def _register_many(
     source_code: Embedding,
     target_code: Embedding,
     offset: Float[Array, "b 3"],
+    sights: tuple[Sight | None, Sight | None],
     config: RegistrationConfig,
     upright: bool,
 ) -> Registration:
     """All pairs of a scene, or of many scenes, in one compiled program."""
 
     def one(
-        s: Array, s_mask: Array, t: Array, t_mask: Array, a: Embedding, b: Embedding, shift: Array
+        s: Array,
+        s_mask: Array,
+        t: Array,
+        t_mask: Array,
+        a: Embedding,
+        b: Embedding,
+        shift: Array,
+        sights: tuple[Sight | None, Sight | None],
     ) -> Registration:
         pair = Pair(
             source=sample(s, s_mask, config.points, config.dense),
@@ -89,10 +103,12 @@ def _register_many(
             source_code=a,
             target_code=b,
             offset=shift,
+            source_sight=sights[0],
+            target_sight=sights[1],
         )
         return register_one(prior, pair, config, upright)
 
-    return jax.vmap(one)(source, source_mask, target, target_mask, source_code, target_code, offset)
+    return jax.vmap(one)(source, source_mask, target, target_mask, source_code, target_code, offset, sights)
 
 
 def register_one(prior: Prior, pair: Pair, config: RegistrationConfig, upright: bool) -> Registration:
@@ -140,6 +156,8 @@ def rescale(pair: Pair, factor: Float[Array, ""]) -> Pair:
         source_code=scale_embedding(pair.source_code, factor),
         target_code=scale_embedding(pair.target_code, factor),
         offset=pair.offset * factor,
+        source_sight=None if pair.source_sight is None else scale_sight(pair.source_sight, factor),
+        target_sight=None if pair.target_sight is None else scale_sight(pair.target_sight, factor),
     )
 
 

@@ -24,10 +24,11 @@ from more2_jax.objects import (
 )
 from more2_jax.prior import Prior
 from more2_jax.progress import Watcher, staged
+from more2_jax.sights import few_sensors, instances_with_sight, objects_with_sight
 from more2_jax.tracking import match_scan, register_in_frame
 from more2_jax.types import Frame, Instance, LivingScene, Mesh, Scan, ScanRecord, SceneObject, Skipped
 
-BACKGROUND_POINTS = 20_000  # of a scan, remembered for the page
+BACKGROUND_POINTS = 20_000  # of a scan, remembered for the page and for what its sensors looked through
 STRAYS = 0.02  # share of an object's points that may lie below the floor,
 BELOW_M = 0.05  # by more than this
 
@@ -68,6 +69,9 @@ def add_scan(
     stage = partial(staged, timing, progress, scan=scan.name)
     with stage("encode", len(instances)):
         embeddings = embed(prior, [i.points for i in instances])
+    if config.registration.free_weight:
+        instances = instances_with_sight(instances, scan, remembered(scan.background))
+        objects = objects_with_sight(objects, scene.scans)
     with stage("match", len(instances)):
         identified = match_scan(objects, instances, embeddings, config, rooms_of(scene, scan))
     found, chance = identified.found, {objects[k].id: p for k, p in identified.gone.items()}
@@ -88,7 +92,7 @@ def add_scan(
     return dataclasses.replace(
         scene,
         scans=(*scene.scans, record(index, scan, instances, skipped, frame)),
-        objects=tuple(objects),
+        objects=tuple(dataclasses.replace(o, sight=None) for o in objects),
         changes=(*scene.changes, changes_between(objects, index - 1, index, config, chance)),
         timing_s=timing,
     )
@@ -174,7 +178,7 @@ def record(
     skipped: tuple[Skipped, ...],
     frame: Frame = SCENE_FRAME,
 ) -> ScanRecord:
-    """What the scene remembers of a scan: of its background, points at even steps, `BACKGROUND_POINTS` at most."""
+    """What the scene remembers of a scan."""
     return ScanRecord(
         index=index,
         name=scan.name,
@@ -182,5 +186,11 @@ def record(
         instances=tuple(i.id for i in instances),
         skipped=skipped,
         frame=frame,
-        background=scan.background[:: max(1, -(-len(scan.background) // BACKGROUND_POINTS))],
+        background=remembered(scan.background),
+        sensors=few_sensors(scan),
     )
+
+
+def remembered(background: Float[np.ndarray, "b 3"]) -> Float[np.ndarray, "k 3"]:
+    """Of what is no instance, points at even steps, `BACKGROUND_POINTS` at most."""
+    return background[:: max(1, -(-len(background) // BACKGROUND_POINTS))]

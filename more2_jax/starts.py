@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from more2_jax.config import RegistrationConfig
 from more2_jax.geometry import Sampled, kabsch, kabsch_rotation
-from more2_jax.types import Embedding, pytree
+from more2_jax.types import Embedding, Sight, pytree
 
 
 @pytree
@@ -24,6 +24,8 @@ class Pair:
     source_code: Embedding
     target_code: Embedding
     offset: Float[Array, "*b 3"]  # source's origin minus target's, metres, in the frame both scans share
+    source_sight: Sight | None = None  # what was seen around each, where sensors are known
+    target_sight: Sight | None = None
 
 
 def embedding_pose(source: Embedding, target: Embedding) -> jaxlie.SE3:

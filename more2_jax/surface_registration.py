@@ -8,7 +8,7 @@ poses that fit about as well are told apart by that.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -29,8 +29,11 @@ from more2_jax.alignment import (
 from more2_jax.config import RegistrationConfig
 from more2_jax.geometry import FAR, Sampled, move, two_way_rms
 from more2_jax.prior import Prior, field_sdf, object_field
+from more2_jax.sight import looked_through
 from more2_jax.starts import Pair
-from more2_jax.types import Embedding, Registration
+from more2_jax.types import Embedding, Registration, Sight
+
+Way = Callable[[jaxlie.SE3], jaxlie.SE3]
 
 STILL = 1e-2  # a last step below this (radians, and shares of the radius) has settled
 # How much worse "it did not move" may fit and still be chosen; so much worse, another pose still competes.
@@ -41,6 +44,7 @@ TURNED_DEG = 15.0  # competing poses differ by more
 APART_DEG = 25.0  # poses kept for refinement differ by at least this
 OFF_FIELD = 0.1  # canonical units: farther than this from the other's completed surface is this far
 ABOUT_AS_WELL = 0.2  # of misfit: poses that fit worse than the best by more are not the prior's to choose
+CLEARLY = 0.05  # shares of the radius: a point so deep in free space counts in full
 LIFTED = 0.1  # shares of the radius: an object lifted by this costs all of `lift_weight`
 
 
@@ -53,7 +57,7 @@ def register_surfaces(
     """
     whole = [whole_surface(c.dense, c.dense_mask) for c in (pair.source, pair.target)]
     coarse = [coarse_of(s, config) for s in whole]
-    starts, _ = search(starts, coarse[0], coarse[1], pair.offset, config, upright)
+    starts, _ = search(starts, coarse[0], coarse[1], pair, config, upright)
     source, target = (thinned(s, config.surface_points) for s in whole)
     stayed = jax.tree.map(lambda x: x[None], jaxlie.SE3.from_translation(pair.offset))
     if config.identity_start:
@@ -64,7 +68,7 @@ def register_surfaces(
     if config.identity_start:
         poses = join(poses, stayed)  # also exactly as it is
     misfits = jax.vmap(lambda T: misfit(T, source, target, truncations))(poses)
-    costs = misfits + lifted(poses, pair.offset, config, upright)
+    costs = misfits + lifted(poses, pair.offset, config, upright) + freed(poses, pair, source, target, config)
     doubt = doubts(prior, poses, costs, pair, whole, config)
     best = choose(costs, config.identity_start, doubt)
     T = polished(jax.tree.map(lambda x: x[best], poses), whole, misfits[best], config, upright)
@@ -94,7 +98,7 @@ def search(
     starts: jaxlie.SE3,
     source: Surface,
     target: Surface,
-    offset: Float[Array, "3"],
+    pair: Pair,
     config: RegistrationConfig,
     upright: bool,
 ) -> tuple[jaxlie.SE3, Float[Array, " k"]]:
@@ -102,7 +106,7 @@ def search(
     reach = (config.search_reach, config.first_reach)
     moved = jax.vmap(lambda T: align(T, source, target, reach, config.coarse_steps, upright))(starts)
     cost = jax.vmap(lambda T: misfit(T, source, target, (config.truncation,)))(moved)
-    cost = cost + lifted(moved, offset, config, upright)
+    cost = cost + lifted(moved, pair.offset, config, upright) + freed(moved, pair, source, target, config)
     best = lowest_apart(cost, moved.rotation(), min(config.keep_starts, len(cost)))
     return jax.tree.map(lambda x: x[best], moved), cost[best]
 
@@ -114,6 +118,24 @@ def lifted(
     height = jnp.abs(poses.translation()[:, 2] - offset[2])
     weight = config.lift_weight if upright and config.identity_start else 0.0
     return weight * jnp.minimum(height / LIFTED, 1.0)
+
+
+def freed(
+    poses: jaxlie.SE3, pair: Pair, source: Surface, target: Surface, config: RegistrationConfig
+) -> Float[Array, " k"]:
+    """What it costs to lie where the other cloud's sensors looked through: of both clouds, the share that does."""
+    sights = ((pair.target_sight, source, lambda T: T), (pair.source_sight, target, lambda T: T.inverse()))
+    cost = jnp.zeros(poses.wxyz_xyz.shape[0])
+    for sight, surface, way in sights if config.free_weight else ():
+        if sight is None:
+            continue
+        cloud = surface.sampled
+
+        def share(T: jaxlie.SE3, sight: Sight = sight, cloud: Sampled = cloud, way: Way = way) -> Array:
+            return looked_through(sight, way(T) @ cloud.points, cloud.mask, CLEARLY)
+
+        cost += config.free_weight / 2 * jax.vmap(share)(poses)
+    return cost
 
 
 def doubts(

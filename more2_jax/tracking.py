@@ -27,6 +27,7 @@ from more2_jax.objects import (
 )
 from more2_jax.prior import Prior
 from more2_jax.registration import register, world_pose
+from more2_jax.sight import padded_sights
 from more2_jax.types import (
     Embedding,
     Frame,
@@ -117,7 +118,7 @@ def distances(objects: Sequence[SceneObject], centers: Float[np.ndarray, "m 3"])
 def last_seen(o: SceneObject) -> tuple[Known, Pose]:
     """All accumulated of an object, where it last stood in the scene, and the pose from there to its own frame."""
     T_scene_ref = place_of(o.observations[-1])
-    known = Known(points=accumulated_points(o), embedding=o.embedding, color=o.color)
+    known = Known(points=accumulated_points(o), embedding=o.embedding, color=o.color, sight=o.sight)
     return moved(known, T_scene_ref), np.linalg.inv(T_scene_ref)
 
 
@@ -146,18 +147,27 @@ def register_scan(
     """Registers all that was found in one call: an observation each. `frame`: of the scan and its embeddings."""
     if not found:
         return []
-    here = [
-        moved(
-            Known(points=instances[f.instance].points, embedding=embeddings[f.instance]), frame.T_scene_scan
-        )
-        for f in found
+    new = [
+        Known(points=i.points, embedding=e, sight=i.sight)
+        for i, e in ((instances[f.instance], embeddings[f.instance]) for f in found)
     ]
+    here = [moved(k, frame.T_scene_scan) for k in new]
     known, frames = zip(*(target_of(objects[f.object], config) for f in found), strict=True)
     source = padded([k.points for k in here])
     target = padded([k.points for k in known])
     source_code = with_origin(stack([k.embedding for k in here])[0], np.asarray(source.origin))
     target_code = with_origin(stack([k.embedding for k in known])[0], np.asarray(target.origin))
-    result = register(prior, source, target, source_code, target_code, config.registration, config.upright)
+    result = register(
+        prior,
+        source,
+        target,
+        source_code,
+        target_code,
+        config.registration,
+        config.upright,
+        source_sight=padded_sights([k.sight for k in here], np.asarray(source.origin)),
+        target_sight=padded_sights([k.sight for k in known], np.asarray(target.origin)),
+    )
     result = jax.device_get(result)
     return [
         _observation(result, n, source, target, frames[n], f, scan, instances[f.instance].id, frame)

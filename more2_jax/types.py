@@ -49,6 +49,17 @@ class Anchors:
 
 
 @pytree
+class Sight:
+    """What sensors at known places saw around one object: depth images that say how far space is free (`sight.py`)."""
+
+    eye: Float[Array | np.ndarray, "*batch v 3"]  # where each stood, in the object's frame, metres
+    turn: Float[Array | np.ndarray, "*batch v 3 3"]  # rows: across, down its image, and forward
+    half: Float[Array | np.ndarray, "*batch v"]  # tangent of half the angle that the image spans
+    side: Float[Array | np.ndarray, "*batch v"]  # pixels of a row, the first ones of `clear`
+    clear: Float[Array | np.ndarray, "*batch v p p"]  # metres that are free along a pixel's ray; 0: not known
+
+
+@pytree
 class Embedding:
     """What the encoder says of one object (paper §3.1): `Φ(sRX + t) = (inv, R·eqv, s·scale, sR·center + t)`."""
 
@@ -134,6 +145,7 @@ class Instance:
     points: Float[np.ndarray, "n 3"]
     label: str | None = None
     colors: Int[np.ndarray, "n 3"] | None = None  # uint8
+    sight: Sight | None = None  # what the scan's sensors saw around it, where that is known and asked for
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -152,6 +164,11 @@ class Scan:
     source: str
     instances: tuple[Instance, ...]
     background: Float[np.ndarray, "b 3"] = field(default_factory=lambda: np.zeros((0, 3)))
+    sensors: Float[np.ndarray, "s 3"] = (
+        field(  # where its sensors stood, in its frame, metres; none: not known
+            default_factory=lambda: np.zeros((0, 3))
+        )
+    )
     skipped: tuple[Skipped, ...] = ()
     warnings: tuple[str, ...] = ()
 
@@ -201,6 +218,9 @@ class SceneObject:
     embedding: Embedding  # NumPy leaves, unbatched; frame of the reference observation
     mesh: Mesh | None = None
     color: Color | None = None  # of the accumulated observations whose scans have colours
+    sight: Sight | None = (
+        None  # what sensors saw around it, in its frame; made when a scan is added, never kept
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -227,6 +247,9 @@ class ScanRecord:
     skipped: tuple[Skipped, ...] = ()
     frame: Frame = field(default_factory=Frame, compare=False)
     background: Float[np.ndarray, "b 3"] = field(  # thinned, to look at; metres, in the scan's frame, float64
+        default_factory=lambda: np.zeros((0, 3)), compare=False, repr=False
+    )
+    sensors: Float[np.ndarray, "s 3"] = field(  # where they stood, in the scan's frame, float64
         default_factory=lambda: np.zeros((0, 3)), compare=False, repr=False
     )
 

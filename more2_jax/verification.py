@@ -24,7 +24,7 @@ from more2_jax.color import color_evidence
 from more2_jax.config import SceneConfig
 from more2_jax.encoding import at_zero, padded, stack, with_origin
 from more2_jax.evidence import HYPOTHESES, Compared, log_odds, pair_evidence
-from more2_jax.types import Color, Embedding
+from more2_jax.types import Color, Embedding, Sight
 
 Points = Float[np.ndarray, "_ 3"]
 LogOdds = Float[np.ndarray, "n m"]
@@ -44,6 +44,7 @@ class Known:
     points: Points
     embedding: Embedding
     color: Color | None = None
+    sight: Sight | None = None
 
 
 @dataclass(frozen=True, kw_only=True)

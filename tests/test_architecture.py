@@ -15,7 +15,17 @@ LONGEST_FILE, LONGEST_FUNCTION = 400, 40  # lines
 # Low to high; a module imports from its own layer or those before it. `data.*` and `commands.*` are folders.
 LAYERS = {
     "types": ("types", "config", "progress"),
-    "tools": ("geometry", "nearest_grid", "batching", "descent", "metrics", "meshfile", "color", "data"),
+    "tools": (
+        "geometry",
+        "nearest_grid",
+        "sight",
+        "batching",
+        "descent",
+        "metrics",
+        "meshfile",
+        "color",
+        "data",
+    ),
     "network": (
         "vn",
         "neighbours",
@@ -41,7 +51,17 @@ LAYERS = {
         "meshing",
         "joint",
     ),
-    "scene": ("objects", "encoding", "verification", "consensus", "frames", "tracking", "fitting", "scene"),
+    "scene": (
+        "objects",
+        "sights",
+        "encoding",
+        "verification",
+        "consensus",
+        "frames",
+        "tracking",
+        "fitting",
+        "scene",
+    ),
     "programs": ("io", "report", "export", "demo", "commands", "cli", "train", "eval"),
 }
 HEIGHT = {name: height for height, names in enumerate(LAYERS.values()) for name in names}

@@ -30,6 +30,7 @@ def test_scans_are_posed_and_merged_in_order(tmp_path):
     np.testing.assert_allclose(found.points[:100], POINTS[:100], atol=1e-12)
     expected = (TURN.as_matrix() @ POINTS[100:].T).T + far
     np.testing.assert_allclose(found.points[100:], expected, rtol=0, atol=2e-9)
+    np.testing.assert_allclose(found.sensors[-1], far)
     assert found.instance is None and found.colors is None and found.unit == "m"
 
 

@@ -96,8 +96,9 @@ def plane_frames():
 @pytest.mark.parametrize("zipped", [True, False])
 def test_back_projected_frames_lie_on_the_wall_they_saw(tmp_path, zipped):
     write_sequence(tmp_path, sequence_files(plane_frames(), CAMERA), zipped=zipped)
-    points, skipped = threerscan.depth_points(threerscan.open_sequence(tmp_path))
+    points, sensors, skipped = threerscan.depth_points(threerscan.open_sequence(tmp_path))
     assert len(points) == 3 * 48 * 64 and skipped == ()
+    np.testing.assert_allclose(sensors, EYES, atol=1e-6)
     # half a millimetre of rounding along rays up to 1.2 times as long as their depth
     assert np.abs(points @ PLANE[0] - PLANE[1]).max() < 1e-3
 
@@ -116,7 +117,7 @@ def test_one_pixel_by_hand():
 def test_depth_points_take_the_object_of_the_nearest_vertex(tmp_path):
     frames = plane_frames()
     write_sequence(tmp_path, sequence_files(frames, CAMERA))
-    seen, _ = threerscan.depth_points(threerscan.open_sequence(tmp_path))
+    seen, eyes, _ = threerscan.depth_points(threerscan.open_sequence(tmp_path))
     right = seen[seen[:, 1] > 0.2]
     vertices = np.concatenate([right[::3], seen[seen[:, 1] < -0.2][::3]])
     ids = np.repeat([35, 1], [len(right[::3]), len(vertices) - len(right[::3])])
@@ -124,6 +125,7 @@ def test_depth_points_take_the_object_of_the_nearest_vertex(tmp_path):
     write_semseg(tmp_path, LABELS)
     scan = read_scan(tmp_path, depth_frames=True)
     (chair,) = scan.instances
+    np.testing.assert_array_equal(scan.sensors, eyes)
     assert chair.id == 35 and chair.label == "chair" and chair.colors is None
     # by hand, in chunks: the nearest vertex of every point
     away = np.concatenate(
@@ -149,7 +151,7 @@ def test_frames_without_tracking_are_left_out_and_counted(tmp_path):
     scaled = 2 * np.eye(4)
     frames = [(depth, None), (depth, lost), (depth, np.eye(4)), (depth, "1 0 0"), (depth, scaled)]
     write_sequence(tmp_path, sequence_files(frames, CAMERA))
-    points, (skipped,) = threerscan.depth_points(threerscan.open_sequence(tmp_path))
+    points, _, (skipped,) = threerscan.depth_points(threerscan.open_sequence(tmp_path))
     assert len(points) == 48 * 64
     assert skipped.what == "4 of 5 depth frames"
 
@@ -162,10 +164,11 @@ def test_many_frames_are_thinned_evenly_and_always_alike(tmp_path, monkeypatch):
     for i, T in enumerate(poses):
         T[2, 3] = i
     write_sequence(tmp_path, sequence_files([(depth, T) for T in poses], CAMERA))
-    points, _ = threerscan.depth_points(threerscan.open_sequence(tmp_path))
+    points, sensors, _ = threerscan.depth_points(threerscan.open_sequence(tmp_path))
     assert len(points) == 4 * 12 * 16
+    np.testing.assert_allclose(sensors[:, 2], [0, 3, 6, 9])
     np.testing.assert_allclose(np.unique(points[:, 2]), [1, 4, 7, 10])  # frames 0, 3, 6, 9, a metre ahead
-    again, _ = threerscan.depth_points(threerscan.open_sequence(tmp_path))
+    again, *_ = threerscan.depth_points(threerscan.open_sequence(tmp_path))
     np.testing.assert_array_equal(points, again)
 
 

@@ -47,6 +47,9 @@ class LabelledCloud:
     skipped: tuple[Skipped, ...] = ()
     unit: str | None = None  # m, cm or mm where the format fixes it, whatever the caller says
     warnings: tuple[str, ...] = ()
+    sensors: Float[np.ndarray, "s 3"] | None = (
+        None  # where they stood, as `points`; None: the file does not say
+    )
     rows: Bool[np.ndarray, "r"] | None = None  # which rows of the file the points are; None: all
 
     @property

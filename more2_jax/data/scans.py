@@ -40,8 +40,9 @@ def read_scan(
 
     `path` is a PLY whose vertices carry an integer property naming the instance (`instance`, `instance_id`,
     `objectId`, `object_id` or `label`, in this order; `instance_property` names another), an NPZ with
-    `points` (n, 3), `instance` (n,) and optional `label` (n,), `color` or `colors` (n, 3), a folder of one PLY per
-    object, or another of `data.formats.registry`. Instance ids ≤ 0 are background. `unit` is the file's: m, cm or mm.
+    `points` (n, 3), `instance` (n,) and optional `label` (n,), `color` or `colors` (n, 3), `sensors` (s, 3), a folder
+    of one PLY per object, or another of `data.formats.registry`. `<scan>.sensors.txt` beside it may say where its
+    sensors stood, x y z a line. Instance ids ≤ 0 are background. `unit` is the file's: m, cm or mm.
     Instances of fewer than `min_points` points are reported in `Scan.skipped`; sizes that look like another
     unit, in `Scan.warnings`. `masks` are predicted ones (`data.masks`): those scored `min_score` or more replace
     the scan's own. `segment="geometric"` cuts a cloud without instances into planes and clusters; `depth_frames`
@@ -53,15 +54,14 @@ def read_scan(
     path = Path(path)
     if unit not in UNITS_M or segment not in (None, "geometric"):
         raise ValueError(f"unit {unit!r}, segment {segment!r}; needed m, cm or mm; geometric or None")
+    masks = None if masks is None else Path(masks)
+    needed = segment is None and masks is None
     options = ReadOptions(
-        instance_property=instance_property,
-        masks=None if masks is None else Path(masks),
-        masks_needed=segment is None and masks is None,
-        depth_frames=depth_frames,
+        instance_property=instance_property, masks=masks, masks_needed=needed, depth_frames=depth_frames
     )
     cloud = _read(path, options)
     if masks is not None:
-        cloud = lay_masks(cloud, path, Path(masks), min_score)
+        cloud = lay_masks(cloud, path, masks, min_score)
     if segment is not None:
         cloud = _segmented(path, cloud, unit)
     return _scan(path, cloud, unit, min_points)
@@ -132,6 +132,7 @@ def _scan(path: Path, cloud: LabelledCloud, unit: str, min_points: int) -> Scan:
         )
     _check_points(path, cloud.points)
     points = cloud.points * UNITS_M[unit]
+    sensors = sensors_of(path, cloud)
     background = points[cloud.instance <= 0]
     kept, skipped = _instances(cloud, cloud.instance, points, min_points)
     if not kept:
@@ -141,9 +142,30 @@ def _scan(path: Path, cloud: LabelledCloud, unit: str, min_points: int) -> Scan:
         source=str(path),
         instances=kept,
         background=background,
+        sensors=sensors * UNITS_M[unit],
         skipped=(*cloud.skipped, *skipped),
         warnings=(*cloud.warnings, *_unit_warnings(kept, unit)),
     )
+
+
+def sensors_of(path: Path, cloud: LabelledCloud) -> Float[np.ndarray, "s 3"]:
+    """Where the scan's sensors stood: what `<scan>.sensors.txt` beside it says, else what the scan itself says.
+
+    A line a place, x y z as the scan's points. None (0 rows) where neither says. Raises ValueError, in one line,
+    where that is no list of finite places.
+    """
+    beside = path.with_name(f"{path.stem if path.is_file() else path.name}.sensors.txt")
+    sensors = np.zeros((0, 3)) if cloud.sensors is None else cloud.sensors
+    if beside.is_file():
+        path = beside
+        try:
+            lines = beside.read_text(encoding="utf-8").splitlines()
+            sensors = np.loadtxt([line for line in lines if line.strip()] or ["nothing"], np.float64, ndmin=2)
+        except (ValueError, OSError) as error:
+            raise ValueError(f"{beside}: not numbers ({one_line(error)}); needed lines of x y z") from error
+    if sensors.shape[1:] != (3,) or not np.isfinite(sensors).all():
+        raise ValueError(f"{path}: places of sensors {sensors.shape}; needed (s, 3) finite numbers")
+    return sensors
 
 
 def _instances(

@@ -38,22 +38,26 @@ def read(path: Path, options: ReadOptions) -> LabelledCloud:
             image.close()
     except Exception as error:
         raise ValueError(f"{path}: truncated or damaged E57 ({one_line(error)})") from error
-    colors = [color for _, color, _ in scans if color is not None]
+    colors = [color for _, color, _, _ in scans if color is not None]
     return LabelledCloud(
-        points=np.concatenate([np.zeros((0, 3)), *(points for points, _, _ in scans)]),
+        points=np.concatenate([np.zeros((0, 3)), *(points for points, *_ in scans)]),
         instance=None,
         colors=np.concatenate(colors) if scans and len(colors) == len(scans) else None,
         skipped=tuple(
             Skipped(what=f"{dropped} points of scan {i}", reason="marked as invalid")
-            for i, (_, _, dropped) in enumerate(scans)
+            for i, (_, _, dropped, _) in enumerate(scans)
             if dropped
         ),
         unit="m",
+        sensors=np.array([place for *_, place in scans if place is not None]).reshape(-1, 3),
     )
 
 
-def _scan(libe57: Any, image: Any, node: Any) -> tuple[np.ndarray, np.ndarray | None, int]:
-    """Points in the file's frame, colours, and how many points were marked as invalid."""
+def _scan(libe57: Any, image: Any, node: Any) -> tuple[np.ndarray, np.ndarray | None, int, np.ndarray | None]:
+    """Points in the file's frame, colours, how many points were marked as invalid, and where the scanner stood.
+
+    That is known where the scan has a pose: a scanner stands at the zero of its own points.
+    """
     compressed = node["points"]
     prototype = libe57.StructureNode(compressed.prototype())
     has = {prototype.get(i).elementName() for i in range(prototype.childCount())}
@@ -73,7 +77,8 @@ def _scan(libe57: Any, image: Any, node: Any) -> tuple[np.ndarray, np.ndarray | 
     if COLORS[0] in columns:
         rgb = np.stack([columns[c][good] for c in COLORS], axis=-1)
         colors = _eight_bits(rgb, *_color_limits(node, prototype))
-    return _posed(node, points), colors, int((~good).sum())
+    place = _posed(node, np.zeros((1, 3)))[0] if node.isDefined("pose") else None
+    return _posed(node, points), colors, int((~good).sum()), place
 
 
 def _columns(libe57: Any, image: Any, compressed: Any, names: list[str]) -> dict[str, np.ndarray]:

@@ -64,10 +64,9 @@ def read(path: Path, options: ReadOptions) -> LabelledCloud:
     instance = _instances(annotated, cloud)
     labels, empty, remarks = _labels(folder, instance)
     instance, structural = drop_background(instance, labels)
-    points, skipped = cloud.points, (*structural, *empty)
+    points, skipped, sensors = cloud.points, (*structural, *empty), None
     if options.depth_frames:
-        sequence = open_sequence(folder)
-        found, lost = depth_points(sequence)
+        found, sensors, lost = depth_points(open_sequence(folder))
         instance = nearest_instance(cloud.points, instance, found)
         points, skipped = found, (*skipped, *lost)
     return LabelledCloud(
@@ -77,6 +76,7 @@ def read(path: Path, options: ReadOptions) -> LabelledCloud:
         skipped=skipped,
         unit="m",
         warnings=remarks,
+        sensors=sensors,
     )
 
 
@@ -107,8 +107,8 @@ def _labels(
 def _without_masks(folder: Path, options: ReadOptions) -> LabelledCloud:
     """A scan of the hidden test set, or one of which only the raw data were fetched."""
     if options.depth_frames:
-        points, lost = depth_points(open_sequence(folder))
-        return LabelledCloud(points=points, instance=None, skipped=lost, unit="m")
+        points, sensors, lost = depth_points(open_sequence(folder))
+        return LabelledCloud(points=points, instance=None, skipped=lost, unit="m", sensors=sensors)
     mesh = _first(folder, MESHES)
     if mesh is None:
         raise ValueError(f"{folder}: no {ANNOTATED[0]} and no {MESHES[0]}; needed one of them")
@@ -130,8 +130,10 @@ def read_obj_vertices(path: Path) -> Float[np.ndarray, "n 3"]:
         raise ValueError(f"{path}: a line 'v' has no x y z ({' '.join(str(error).split())})") from error
 
 
-def depth_points(sequence: Sequence) -> tuple[Float[np.ndarray, "n 3"], tuple[Skipped, ...]]:
-    """Back-projected points of evenly spaced frames in the world, and which frames were left out.
+def depth_points(
+    sequence: Sequence,
+) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "f 3"], tuple[Skipped, ...]]:
+    """Back-projected points of evenly spaced frames and the camera's places, in the world; frames left out.
 
     At most `MOST_FRAMES` frames and about `MOST_POINTS` points: pixels are taken in a fixed stride, so the
     same sequence gives the same points.
@@ -152,7 +154,8 @@ def depth_points(sequence: Sequence) -> tuple[Float[np.ndarray, "n 3"], tuple[Sk
         parts.append(back_project(depth, sequence.intrinsics, T_world_camera, stride))
     reason = "no pose that is a rigid motion: tracking was lost"
     skipped = (Skipped(what=f"{lost} of {len(sequence.frames)} depth frames", reason=reason),) if lost else ()
-    return np.concatenate(parts), skipped
+    places = np.array([posed[i][1][:3, 3] for i in chosen]).reshape(-1, 3)
+    return np.concatenate(parts), places, skipped
 
 
 def nearest_instance(
