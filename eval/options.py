@@ -65,13 +65,15 @@ def benchmark(o: Options) -> Benchmark:
             f"scenes {o.scenes}, visits {o.visits}, chunk {o.chunk}, batch {o.batch}, at once {o.at_once}; needed 0"
             " (all) or more, two visits at least, positive chunk, batch and number at once"
         )
-    if o.dataset == "3rscan":
-        return threerscan(o.data, split=o.split, predicted=o.masks == "predicted")
-    if o.masks == "predicted":
+    if o.masks == "predicted" and o.dataset != "3rscan":
         raise ValueError(
             "predicted masks are read for 3rscan only; damaged ones are merged, split, eroded, wrong"
         )
-    data = flyingshape(o.data)
+    data = (
+        threerscan(o.data, split=o.split, predicted=o.masks == "predicted")
+        if o.dataset == "3rscan"
+        else flyingshape(o.data)
+    )
     return data if o.sensors else replace(data, read=lambda name: without_sensors(data.read(name)))
 
 

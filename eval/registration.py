@@ -158,7 +158,9 @@ def own_records(
     began = time.perf_counter()
     codes = embed_all(prior, [c for pair in clouds for c in pair], batch)
     encoding_s = (time.perf_counter() - began) / len(pairs)
+    began = time.perf_counter()
     sights = [p.sights() for p in pairs]
+    looking_s = (time.perf_counter() - began) / len(pairs)
     ready = [
         PairToRegister(
             source=s,
@@ -175,6 +177,7 @@ def own_records(
         began = time.perf_counter()
         poses = register_all(prior, ready, config, upright, batch)
         seconds = encoding_s + (time.perf_counter() - began) / len(pairs)
+        seconds += looking_s if config.free_weight else 0.0
         found += [scored(p, T, name, seconds) for p, T in zip(pairs, poses, strict=True)]
     return found
 

@@ -12,6 +12,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -145,17 +146,16 @@ def scale_sight(s: Sight, factor: Float[Array, ""]) -> Sight:
 def clearance(s: Sight, points: Float[Array, "n 3"]) -> Float[Array, " n"]:
     """How far every point lies in front of where space stops being free; 0 where no view knows it to be free."""
 
-    def one(eye: Array, turn: Array, half: Array, side: Array, clear: Array) -> Float[Array, " n"]:
-        x, y, z = ((points - eye) @ turn.T).T
+    def of_view(view: Sight) -> Float[Array, " n"]:
+        x, y, z = ((points - view.eye) @ view.turn.T).T
         depth = jnp.where(z > 0, z, 1.0)
-        pixel = [jnp.floor((v / depth / half + 1) / 2 * side) for v in (x, y)]
-        within = (z > 0) & jnp.all(jnp.stack([(p >= 0) & (p < side) for p in pixel]), axis=0)
-        row, column = (jnp.clip(p, 0, PIXELS - 1).astype(jnp.int32) for p in pixel)
-        ahead = clear[row, column] - jnp.linalg.norm(points - eye, axis=1)
+        row, column = (jnp.floor((v / depth / view.half + 1) / 2 * view.side) for v in (x, y))
+        within = (z > 0) & (jnp.minimum(row, column) >= 0) & (jnp.maximum(row, column) < view.side)
+        row, column = (jnp.clip(p, 0, PIXELS - 1).astype(jnp.int32) for p in (row, column))
+        ahead = view.clear[row, column] - jnp.linalg.norm(points - view.eye, axis=1)
         return jnp.where(within, jnp.maximum(ahead, 0.0), 0.0)
 
-    views = [one(s.eye[k], s.turn[k], s.half[k], s.side[k], s.clear[k]) for k in range(len(s.half))]
-    return jnp.max(jnp.stack(views), axis=0)
+    return jax.vmap(of_view)(s).max(axis=0)
 
 
 def looked_through(

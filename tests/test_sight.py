@@ -10,11 +10,16 @@ import pieces
 import pytest
 from scipy.spatial.transform import Rotation
 
+from eval.options import without_sensors
+from eval.registration import own_settings, sight_in
+from eval.truth import KnownScene
+from more2_jax import tracking
 from more2_jax.alignment import whole_surface
 from more2_jax.config import preset
 from more2_jax.data.scans import read_scan
 from more2_jax.geometry import Sampled
 from more2_jax.io import load_scene, save_scene
+from more2_jax.objects import seen_again
 from more2_jax.scene import add_scan, start_scene
 from more2_jax.sight import (
     PIXELS,
@@ -28,6 +33,7 @@ from more2_jax.sight import (
     sight_of,
     spread,
 )
+from more2_jax.sights import objects_with_sight
 from more2_jax.starts import Pair
 from more2_jax.surface_registration import CLEARLY, freed
 from more2_jax.types import Embedding, Instance, Scan
@@ -171,7 +177,7 @@ def test_a_pose_in_front_of_what_was_seen_costs_and_the_right_one_does_not(sight
     still = jaxlie.SE3.identity()
     nearer = jaxlie.SE3.from_translation(jnp.array([0.0, -0.3, 0.0]))
     poses = jax.tree.map(lambda *x: jnp.stack(x), still, nearer)
-    face, config = surfaces_of(FACE), ROBUST.registration
+    face, config = surfaces_of(FACE[::20]), ROBUST.registration
     right, wrong = freed(poses, pair_with(sight), face, face, config)
     assert right < 0.05 * config.free_weight and wrong > 0.45 * config.free_weight
     assert not freed(poses, pair_with(None), face, face, config).any()
@@ -193,18 +199,66 @@ def scan_of(name, shift, sensors):
     return Scan(name=name, source=name, instances=instances, background=WALL + [0, 2.0, 0], sensors=sensors)
 
 
-def test_a_saved_scene_goes_on_as_one_in_memory_does(tiny_prior, tmp_path):
+class Asked(Exception):
+    """Stops a scene where registration would begin."""
+
+
+@pytest.fixture
+def sights_asked(monkeypatch):
+    """What registration is given, instead of registering."""
+    given = []
+
+    def register(*_, source_sight, target_sight):
+        given.append((source_sight, target_sight))
+        raise Asked
+
+    monkeypatch.setattr(tracking, "register", register)
+    return given
+
+
+def test_registration_is_told_by_a_scene_in_memory_and_by_a_saved_one(tiny_prior, tmp_path, sights_asked):
+    config = dataclasses.replace(ROBUST, matching=preset("paper").matching)
     sensors = np.array([[0.0, -4.0, 1.5], [1.0, -4.0, 1.5]])
-    first = start_scene(tiny_prior, scan_of("a", np.zeros(3), sensors), ROBUST)
-    save_scene(first, tmp_path / "scene", ROBUST)
-    again, config = load_scene(tmp_path / "scene")
+    first = start_scene(tiny_prior, scan_of("a", np.zeros(3), sensors), config)
+    save_scene(first, tmp_path / "scene", config)
+    again, _ = load_scene(tmp_path / "scene")
     np.testing.assert_array_equal(again.scans[0].sensors, sensors)
     second = scan_of("b", np.array([0.2, 0.1, 0.0]), sensors)
-    one, other = (add_scan(tiny_prior, s, second, c) for s, c in ((first, ROBUST), (again, config)))
-    assert all(o.sight is None for o in one.objects)
-    for a, b in zip(one.objects, other.objects, strict=True):
-        for x, y in zip(a.observations, b.observations, strict=True):
-            np.testing.assert_allclose(x.T_ref_scan, y.T_ref_scan, atol=1e-5)
+    for scene in (first, again):
+        with pytest.raises(Asked):
+            add_scan(tiny_prior, scene, second, config)
+    (here, there), saved = sights_asked
+    assert (here.clear > 0).any() and (there.clear > 0).any()
+    for one, other in zip(jax.tree.leaves((here, there)), jax.tree.leaves(saved), strict=True):
+        np.testing.assert_allclose(one, other, atol=1e-5)
+
+
+def test_without_sensors_or_a_say_registration_is_told_nothing(tiny_prior, sights_asked):
+    sensors = np.array([[0.0, -4.0, 1.5]])
+    deaf = dataclasses.replace(ROBUST, registration=dataclasses.replace(ROBUST.registration, free_weight=0.0))
+    for config, places in ((ROBUST, np.zeros((0, 3))), (deaf, sensors)):
+        config = dataclasses.replace(config, matching=preset("paper").matching)
+        scene = start_scene(tiny_prior, scan_of("a", np.zeros(3), places), config)
+        with pytest.raises(Asked):
+            add_scan(tiny_prior, scene, scan_of("b", np.zeros(3), places), config)
+    assert sights_asked == [(None, None)] * 2
+
+
+def test_an_objects_views_are_of_all_that_make_up_its_shape(tiny_prior):
+    sensors = np.array([[0.0, -4.0, 1.5]])
+    scans = [scan_of("a", np.zeros(3), sensors), scan_of("b", np.array([0.5, 0.0, 0.0]), sensors)]
+    scene = start_scene(tiny_prior, scans[0], ROBUST)
+    T = pieces.pose(Rotation.identity(), np.array([-0.5, 0.0, 0.0]))
+    seen = dataclasses.replace(scene.objects[0].observations[0], scan=1, T_ref_scan=T)
+    twice = seen_again(scene.objects[0], scans[1].instances[0], seen)
+    records = (*scene.scans, dataclasses.replace(scene.scans[0], index=1))
+    (both,) = objects_with_sight([twice], records)
+    np.testing.assert_allclose(both.sight.eye, [[0.0, -4.0, 1.5], [-0.5, -4.0, 1.5]])
+    doubted = seen_again(
+        scene.objects[0], scans[1].instances[0], dataclasses.replace(seen, accumulated=False)
+    )
+    (one,) = objects_with_sight([doubted], records)
+    np.testing.assert_allclose(one.sight.eye, sensors)
 
 
 # --- where the places come from -----------------------------------------------------------------------------
@@ -245,3 +299,18 @@ def test_a_file_that_names_no_places_is_refused_in_one_line(tmp_path, text):
 def test_an_npz_with_other_places_is_refused_in_one_line(tmp_path, places):
     with pytest.raises(ValueError, match="needed"):
         read_scan(save_npz(tmp_path / "a.npz", sensors=places))
+
+
+def test_a_benchmark_can_keep_the_places_from_the_method():
+    scan = scan_of("a", np.zeros(3), EYE[None])
+    known = KnownScene(name="a", scans=(scan,), objects=())
+    (told,), (blind,) = known.scans, without_sensors(known).scans
+    assert len(told.sensors) == 1 and len(blind.sensors) == 0 and blind.instances == told.instances
+    assert sight_in(told, scan.instances[0].points) is not None
+    assert sight_in(blind, scan.instances[0].points) is None
+
+
+def test_registration_is_measured_with_and_without_them():
+    names = own_settings("robust", upright=True)
+    assert names["ours, robust"].free_weight > 0 == names["ours, robust, sensors unknown"].free_weight
+    assert not any("unknown" in name for name in own_settings("robust", upright=False))
