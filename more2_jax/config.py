@@ -234,7 +234,7 @@ def preset(name: str, *, upright: bool = False) -> SceneConfig:
                 lift_weight=0.1,
                 truncation=0.2,
                 field_weight=2.0,
-                free_weight=8.0 if upright else 0.0,
+                free_weight=1.0 if upright else 0.0,
             ),
             meshing=MeshingConfig(
                 coarse=16,
