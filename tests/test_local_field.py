@@ -17,6 +17,7 @@ from more2_jax.prior import encode_one, init_prior, sdf_one
 from more2_jax.types import Anchors, move_embedding, scale_embedding
 
 CHANNELS, BANDWIDTHS, INPUTS = 4, (0.1, 0.3), 6
+encoded, distance = jax.jit(encode_one), jax.jit(sdf_one)
 
 
 def random_anchors(count: int, seed: int = 0) -> Anchors:
@@ -134,14 +135,14 @@ def test_field_moves_and_grows_with_the_cloud(prior, cloud):
         jaxlie.SO3.sample_uniform(jax.random.key(0)), jnp.array([3.0, -2.0, 1.0])
     )
     mask, queries = jnp.ones(len(cloud), bool), 1.2 * cloud[:40]
-    embedding = encode_one(prior, cloud, mask)
-    expected = sdf_one(prior, embedding, queries)
+    embedding = encoded(prior, cloud, mask)
+    expected = distance(prior, embedding, queries)
     assert np.ptp(expected) > 0.01
     moved = jax.vmap(lambda p: T @ (2.5 * p))
-    again = encode_one(prior, moved(cloud), mask)
-    np.testing.assert_allclose(sdf_one(prior, again, moved(queries)), expected, atol=5e-4)
+    again = encoded(prior, moved(cloud), mask)
+    np.testing.assert_allclose(distance(prior, again, moved(queries)), expected, atol=5e-4)
     carried = move_embedding(scale_embedding(embedding, jnp.float32(2.5)), T)
-    np.testing.assert_allclose(sdf_one(prior, carried, moved(queries)), expected, atol=1e-4)
+    np.testing.assert_allclose(distance(prior, carried, moved(queries)), expected, atol=1e-4)
 
 
 def test_gradients_are_finite_with_few_real_points(prior, cloud):

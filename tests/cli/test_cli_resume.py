@@ -79,7 +79,7 @@ def told(folder: Path) -> dict:
 @pytest.mark.parametrize(
     ("place", "nth", "sent", "kept"),
     [
-        ("mesh_of", 2, signal.SIGINT, 3),  # between two meshes
+        pytest.param("mesh_of", 2, signal.SIGINT, 3, marks=pytest.mark.slow),  # between two meshes
         ("write_report", 2, signal.SIGKILL, 1),  # while the second scan is saved
         pytest.param("write_report", 2, signal.SIGINT, 1, marks=pytest.mark.slow),
         pytest.param(
