@@ -159,8 +159,8 @@ def sensors_of(path: Path, cloud: LabelledCloud) -> Float[np.ndarray, "s 3"]:
     if beside.is_file():
         path = beside
         try:
-            lines = beside.read_text(encoding="utf-8").splitlines()
-            sensors = np.loadtxt([line for line in lines if line.strip()] or ["nothing"], np.float64, ndmin=2)
+            lines = [line for line in beside.read_text(encoding="utf-8").splitlines() if line.strip()]
+            sensors = np.loadtxt(lines, np.float64, ndmin=2) if lines else np.zeros((0, 0))
         except (ValueError, OSError) as error:
             raise ValueError(f"{beside}: not numbers ({one_line(error)}); needed lines of x y z") from error
     if sensors.shape[1:] != (3,) or not np.isfinite(sensors).all():
