@@ -30,7 +30,7 @@ from more2_jax.config import SceneConfig
 from more2_jax.fitting import fit_objects
 from more2_jax.metrics import apply_pose
 from more2_jax.prior import Prior
-from more2_jax.scene import floor_under, mesh_of
+from more2_jax.scene import mesh_of, record
 from more2_jax.types import Mesh, Observation, SceneObject
 from train.program import run
 
@@ -171,8 +171,9 @@ def embedded(prior: Prior, seen: Sequence[Seen], batch: int) -> list[SceneObject
 
 
 def mesh_seen(prior: Prior, s: Seen, o: SceneObject, config: SceneConfig) -> Mesh | None:
-    """The mesh of an object in the room that its first scan shows."""
-    return mesh_of(prior, o, config, floor_under(o, s.scene.scans[0].background, config))
+    """The mesh of an object in the room that its scans show."""
+    scans = [record(k, scan, list(scan.instances), ()) for k, scan in enumerate(s.scene.scans)]
+    return mesh_of(prior, o, scans, config)
 
 
 def fitted_in_batches(

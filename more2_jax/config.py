@@ -242,7 +242,7 @@ def preset(name: str, *, upright: bool = False) -> SceneConfig:
                 field_resolution=32,
                 level="observed",
                 seen_reach=0.02,
-                screening=0.08,
+                screening=0.12,
                 floor=True,
             ),
             joint=JointConfig(points=128, start="accumulated", steps=40, eqv_learning_rate=1e-3),

@@ -13,6 +13,7 @@ import numpy as np
 from jax import Array
 from jaxtyping import Bool, Float
 from scipy.ndimage import binary_dilation
+from scipy.spatial import KDTree
 from skimage.measure import marching_cubes
 
 from more2_jax.config import MeshingConfig
@@ -24,6 +25,8 @@ from more2_jax.types import Embedding, Mesh
 # caches (2048 take 0.6 times as long as 8192 at a time); accelerators want large products.
 CHUNK = {"cpu": 2048}
 CHUNK_OF_OTHERS = 32768
+SLOPES = 4096  # points at most where the field's slope is asked; it has little to say at the others either
+OBSERVED = 4096  # and where its level is
 
 _values = jax.jit(sdf_one)
 _slopes = jax.jit(jax.grad(lambda *asked: sdf_one(*asked).sum(), argnums=2))
@@ -37,13 +40,15 @@ def extract_mesh(
     level: float = 0.0,
     seen: Float[np.ndarray, "n 3"] | None = None,
     floor: float | None = None,
+    seen_from: Float[np.ndarray, "n s 3"] | None = None,
 ) -> Mesh | None:
     """A level set of one object's field, by default 0; metres in its scan's frame, always closed.
 
     `half_width` (canonical units) is half the edge of the query box. With `seen`, points of the surface in the
-    scan's frame, and a `config.seen_reach`, the surface runs through them. Nothing lies below the height `floor` of
-    that frame. Returns None when the field stays above `level` in the box: there is no surface to show. Raises
-    ValueError unless `resolution` is `coarse` doubled some times.
+    scan's frame, and a `config.seen_reach`, the surface runs through them; each was seen from one of the places
+    `seen_from` (NaN fills up), if they are known. Nothing lies below the height `floor` of that frame. Returns None
+    when the field stays above `level` in the box: there is no surface to show. Raises ValueError unless
+    `resolution` is `coarse` doubled some times.
     """
     doublings = np.log2(config.resolution / config.coarse)
     if doublings < 0 or doublings != int(doublings):
@@ -52,7 +57,7 @@ def extract_mesh(
         )
     half = half_width or config.half_width
     lowest = -np.inf if floor is None else canonical(embedding, np.array([[0.0, 0.0, floor]]))[0, 2]
-    through = surface_through(prior, embedding, seen, config, lowest)
+    through = surface_through(prior, embedding, seen, config, lowest, seen_from)
     ask = partial(_field, prior, embedding, level)
     draw = partial(_drawn, through, lowest)
     first = _grid(config.coarse, half)
@@ -62,7 +67,9 @@ def extract_mesh(
     asked = config.field_resolution or config.resolution
     while len(values) - 1 < config.resolution:
         if through is not None and config.screening and len(values) - 1 == asked:
-            field, values = _sided(through, config.screening, lowest, field, half)
+            exact = through.resolves(2 * half / config.resolution)
+            cells = config.resolution if exact else 2 * asked
+            field, values = _sided(through, config.screening, lowest, field, half, cells)
             continue
         field, values = _refine(ask if 2 * (len(values) - 1) <= asked else None, draw, field, values, half)
     if not (values < 0).any():
@@ -76,21 +83,25 @@ def surface_through(
     seen: Float[np.ndarray, "n 3"] | None,
     config: MeshingConfig,
     lowest: float = -np.inf,
+    seen_from: Float[np.ndarray, "n s 3"] | None = None,
 ) -> SeenSurface | None:
     """What was seen, as planes around the points. None if nothing was, or it is not asked for."""
     if seen is None or not config.seen_reach:
         return None
     points = canonical(embedding, some_of(seen))
-    return seen_surface(points, _in_chunks(_slopes, prior, embedding, points), config.seen_reach, lowest)
+    eyes = None if seen_from is None else canonical(embedding, some_of(seen_from))
+    asked = some_of(points, SLOPES)
+    slope = _in_chunks(_slopes, prior, embedding, asked)[KDTree(asked).query(points, workers=-1)[1]]
+    return seen_surface(points, slope, config.seen_reach, lowest, eyes)
 
 
 def observed_level(prior: Prior, embedding: Embedding, points: Float[np.ndarray, "n 3"]) -> float:
     """The field's median at points (scan's frame) known to lie on the surface, canonical units; 0.1 at most."""
-    values = _field(prior, embedding, 0.0, canonical(embedding, some_of(points)))
+    values = _field(prior, embedding, 0.0, canonical(embedding, some_of(points, OBSERVED)))
     return float(np.clip(np.median(values), -0.1, 0.1))
 
 
-def canonical(embedding: Embedding, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+def canonical(embedding: Embedding, points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
     """Points of the scan's frame in canonical units, relative to the object's centre."""
     return (points - np.asarray(embedding.center, np.float64) - embedding.origin) / float(embedding.scale)
 
@@ -161,14 +172,21 @@ def _refine(
 
 
 def _sided(
-    through: SeenSurface, screening: float, lowest: float, field: Float[np.ndarray, "n n n"], half: float
+    through: SeenSurface,
+    screening: float,
+    lowest: float,
+    field: Float[np.ndarray, "n n n"],
+    half: float,
+    cells: int,
 ) -> tuple[Float[np.ndarray, "m m m"], Float[np.ndarray, "m m m"]]:
-    """Field and values on the grid with half the step: inside and outside as what was seen has them, near it."""
-    cells = 2 * (len(field) - 1)
-    finer, queries = doubled(field), _grid(cells, half)
-    finer = np.maximum(finer.ravel(), lowest - queries[:, 2]).reshape(finer.shape)
-    field = through.screened(finer, half, screening)
-    return field, _drawn(through, lowest, queries, field.ravel()).reshape(field.shape)
+    """Field and values on a finer grid: inside and outside as what was seen has them, near it."""
+    while len(field) - 1 < cells:
+        field = doubled(field)
+    below = lowest - np.linspace(-half, half, cells + 1)
+    field = through.screened(np.maximum(field, below), half, screening)
+    near, values = through.near(half, cells), field.copy()
+    values[near] = through.corrected(np.argwhere(near) * (2 * half / cells) - half, field[near])
+    return field, np.maximum(values, below)
 
 
 def doubled(x: Float[np.ndarray, "n n n"]) -> Float[np.ndarray, "m m m"]:

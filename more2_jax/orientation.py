@@ -1,8 +1,9 @@
-"""Which side of a scanned surface is outside: by what lies behind it, by the field, and by what neighbours say.
+"""Which side of a scanned surface is outside: by who saw it, by what lies behind it, by the field, by its neighbours.
 
-Points alone do not tell. Along the normal, matter ends sooner than free space does: a board's other face is nearer than
-the next shelf. Where nothing lies on either side, the field's slope decides. Votes are then made to agree over a
-signed graph of neighbours (after Hoppe et al., 1992; here one sparse linear system instead of a spanning tree).
+A surface faces the sensor that saw it. Where sensors are not known, points alone do not tell: along the normal, matter
+ends sooner than free space does, a board's other face is nearer than the next shelf. Where nothing lies on either
+side, the field's slope decides. Votes are then made to agree over a signed graph of neighbours (after Hoppe et al.,
+1992; here one sparse linear system instead of a spanning tree).
 """
 
 from __future__ import annotations
@@ -21,36 +22,68 @@ STEP, STEPS, FARTHEST = (
     0.9,
 )  # radii at which the normal is followed: times the last; canonical units
 WIDTH = 0.45  # of what counts as met, times the way to it: a cone
+LINE_OF_SIGHT = 0.25  # and when a sensor is looked for: what stands in its way
 OF_FIELD = 0.3  # what the field's slope weighs, against 1 of the ratio of the ways to what is met
+OF_SURROUNDINGS = 0.25  # what both weigh where sensors are known, against 1 of a sensor
+GRAZING = 0.2  # cosine from which on a sensor sees a side for sure
+VOTERS = 4096  # points that look around; the others hear them
 NEIGHBOURS = 10  # of a point, in the graph
 OWN_VOTE = 0.05  # what a vote weighs, against its neighbours' sum
 SHARP = 8  # power of the agreement of two normals that makes an edge's weight: none across a crease
 
 
 def outward_signs(
-    tree: KDTree, normal: Points, slope: Float[np.ndarray, " n"], gap: float, lowest: float
+    tree: KDTree,
+    normal: Points,
+    slope: Float[np.ndarray, " n"],
+    gap: float,
+    lowest: float,
+    seen_from: Float[np.ndarray, "n s 3"] | None = None,
 ) -> Float[np.ndarray, " n"]:
     """+1 where a point's normal goes outward, −1 where inward.
 
     `tree` holds the points (canonical units); `slope` is by how much the field rises along the normal, −1 to 1; `gap`
-    is the least way that counts; below the height `lowest` there is no free space.
+    is the least way that counts; below the height `lowest` there is no free space. One of the places `seen_from`, if
+    they are known, saw the point; NaN fills up.
     """
-    points = np.asarray(tree.data)
-    ways = [first_met(tree, points, side * normal, gap, lowest) for side in (1, -1)]
-    vote = np.clip(np.log(ways[0] / ways[1]), -1, 1) + OF_FIELD * np.clip(slope, -1, 1)
+    points, few = np.asarray(tree.data), slice(None, None, -(-tree.n // VOTERS))
+    ways = [first_met(tree, points[few], side * normal[few], gap, lowest) for side in (1, -1)]
+    vote = OF_FIELD * np.clip(slope, -1, 1)
+    vote[few] += np.clip(np.log(ways[0] / ways[1]), -1, 1)
+    if seen_from is not None:
+        vote *= OF_SURROUNDINGS
+        vote[few] += side_seen(tree, points[few], normal[few], seen_from[few], gap)
     agreed, _ = cg(*graph(tree, normal, vote), x0=vote, rtol=1e-3, maxiter=200)
     return np.where(agreed < 0, -1.0, 1.0)
 
 
-def first_met(
-    tree: KDTree, points: Points, direction: Points, gap: float, lowest: float
+def side_seen(
+    tree: KDTree, points: Points, normal: Points, seen_from: Float[np.ndarray, "n s 3"], gap: float
 ) -> Float[np.ndarray, " n"]:
-    """How far along `direction` the first other points lie; 1 where none do."""
+    """From −1 to 1: whether the sensors that may have seen a point stand on the side its normal goes to; 0: not known.
+
+    Where some stand on either side, those count that nothing in `tree` hides.
+    """
+    way = seen_from - points[:, None]
+    way = way / np.maximum(np.linalg.norm(way, axis=2, keepdims=True), 1e-12)
+    side = np.nan_to_num(np.clip(np.einsum("nsi,ni->ns", way, normal) / GRAZING, -1, 1))
+    disputed = (side > 0).any(axis=1) & (side < 0).any(axis=1)
+    for sensor in range(side.shape[1]):
+        asked = np.flatnonzero(disputed & (side[:, sensor] != 0))
+        hidden = first_met(tree, points[asked], way[asked, sensor], gap, -np.inf, LINE_OF_SIGHT) < 1
+        side[asked[hidden], sensor] = 0.0
+    return np.clip(side.sum(axis=1), -1, 1)
+
+
+def first_met(
+    tree: KDTree, points: Points, direction: Points, gap: float, lowest: float, width: float = WIDTH
+) -> Float[np.ndarray, " n"]:
+    """How far along `direction` the first other points lie, in a cone of `width` times the way; 1 where none do."""
     found = np.ones(len(points))
     ways = gap * STEP ** np.arange(STEPS)
     for way in ways[ways < FARTHEST][::-1]:
         there = points + way * direction
-        met = tree.query(there, distance_upper_bound=WIDTH * way, workers=-1)[0] < np.inf
+        met = tree.query(there, distance_upper_bound=width * way, workers=-1)[0] < np.inf
         found[met | (there[:, 2] < lowest)] = way
     return found
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from functools import partial
 
 import numpy as np
@@ -24,7 +25,7 @@ from more2_jax.objects import (
 )
 from more2_jax.prior import Prior
 from more2_jax.progress import Watcher, staged
-from more2_jax.sights import few_sensors, instances_with_sight, objects_with_sight
+from more2_jax.sights import few_sensors, instances_with_sight, objects_with_sight, seen_from
 from more2_jax.tracking import match_scan, register_in_frame
 from more2_jax.types import Frame, Instance, LivingScene, Mesh, Scan, ScanRecord, SceneObject, Skipped
 
@@ -114,8 +115,7 @@ def reconstruct(
         objects = fit_objects(prior, objects, again, config)
     with staged(timing, progress, "mesh", len(todo)) as advance:
         for done, k in enumerate(todo, start=1):
-            floor = floor_under(objects[k], scene.scans[objects[k].reference_scan].background, config)
-            objects[k] = dataclasses.replace(objects[k], mesh=mesh_of(prior, objects[k], config, floor))
+            objects[k] = dataclasses.replace(objects[k], mesh=mesh_of(prior, objects[k], scene.scans, config))
             advance(done)
     changes = tuple(
         changes_between(objects, c.from_scan, c.to_scan, config, c.probability) for c in scene.changes
@@ -136,14 +136,17 @@ def floor_under(o: SceneObject, background: Float[np.ndarray, "b 3"], config: Sc
     return floor
 
 
-def mesh_of(prior: Prior, o: SceneObject, config: SceneConfig, floor: float | None = None) -> Mesh | None:
-    """The object's mesh, in a box that holds all that was seen of it, and above `floor` (metres, its frame).
+def mesh_of(prior: Prior, o: SceneObject, scans: Sequence[ScanRecord], config: SceneConfig) -> Mesh | None:
+    """The object's mesh, in a box that holds all that was seen of it, and above the floor of its reference scan.
 
     `level` "observed": seen points lie on the surface, so the field's median there is its bias, and is taken off.
     """
     points = accumulated_points(o)
     level = observed_level(prior, o.embedding, points) if config.meshing.level == "observed" else 0.0
-    return extract_mesh(prior, o.embedding, config.meshing, box_half_width(o, config), level, points, floor)
+    floor = floor_under(o, scans[o.reference_scan].background, config)
+    half = box_half_width(o, config)
+    eyes = seen_from(o, scans) if config.meshing.seen_reach else None
+    return extract_mesh(prior, o.embedding, config.meshing, half, level, points, floor, eyes)
 
 
 def box_half_width(o: SceneObject, config: SceneConfig) -> float:

@@ -16,7 +16,7 @@ import itertools
 
 import numpy as np
 from jaxtyping import Float
-from scipy.fft import next_fast_len
+from scipy.fft import irfftn, next_fast_len, rfftn
 from scipy.spatial import KDTree
 
 Grid = Float[np.ndarray, "n n n"]
@@ -25,6 +25,7 @@ Points = Float[np.ndarray, "p 3"]
 SOFT = 1.5  # cells on either side of the surface in which an indicator goes from 1 to 0
 MARGIN = 2.0  # screening lengths around the box, which the Fourier transform takes as periodic
 AGREE = 0.5  # cosine from which on a neighbour's normal is of the same face,
+CORNERS = np.array(list(itertools.product((0, 1), repeat=3)))  # of a cell
 FLAT = 0.1  # and share of its squared distance that it may lie off that face
 
 
@@ -41,37 +42,36 @@ def screened(
     prior = np.clip(0.5 - field / (2 * SOFT * step), 0.0, 1.0)
     size = next_fast_len(n + int(np.ceil(MARGIN * length / step)), real=True) or n
     k = [2 * np.pi * f(size, step) for f in (np.fft.fftfreq, np.fft.fftfreq, np.fft.rfftfreq)]
-    waves = np.meshgrid(*k, indexing="ij", sparse=True)
+    waves = np.meshgrid(*(x.astype(np.float32) for x in k), indexing="ij", sparse=True)
     squared = sum(w**2 for w in waves)
     # Both gradients as smooth as the grid can hold, or as the points are dense.
     width = max(step, np.sqrt(float(np.median(area))))
     flux = [splat(points, -area * normals[:, i], half, n) for i in range(3)]
-    divergence = sum(1j * w * transform(v, size) for w, v in zip(waves, flux, strict=True))
-    divergence = divergence * np.exp(-0.5 * squared * width**2)
-    of_prior = transform(prior, size)
-    change = -squared * np.exp(-0.5 * squared * step**2) * of_prior - divergence
-    inside = prior + np.fft.irfftn(change / (squared + length**-2), s=[size] * 3, axes=(0, 1, 2))[:n, :n, :n]
-    return (0.5 - inside) * 2 * SOFT * step
+    divergence = sum(np.complex64(1j) * w * transform(v, size) for w, v in zip(waves, flux, strict=True))
+    change = -squared * smooth(squared, step) * transform(prior, size) - smooth(squared, width) * divergence
+    change = irfftn(change / (squared + np.float32(length**-2)), s=[size] * 3, workers=-1)
+    return (0.5 - prior - change[:n, :n, :n]) * 2 * SOFT * step
 
 
 def transform(x: Grid, size: int) -> np.ndarray:
-    """Fourier transform of a grid with empty space after it."""
-    return np.fft.rfftn(x, s=[size] * 3, axes=(0, 1, 2))
+    """Fourier transform of a grid with empty space after it, single precision."""
+    return rfftn(x.astype(np.float32), s=[size] * 3, workers=-1)
+
+
+def smooth(squared: np.ndarray, width: float) -> np.ndarray:
+    """What a Gaussian of this width leaves of waves, given the squares of their numbers."""
+    return np.exp(np.float32(-0.5 * width**2) * squared)
 
 
 def splat(points: Points, value: Float[np.ndarray, " p"], half: float, n: int) -> Grid:
     """Density on the grid of `value` at points, shared by the eight corners of their cells; none of points outside."""
     step = 2 * half / (n - 1)
     place = (points + half) / step
-    corner = np.floor(place).astype(int)
-    share, result = place - corner, np.zeros(n**3)
-    for offset in itertools.product((0, 1), repeat=3):
-        at = corner + offset
-        held = ((at >= 0) & (at < n)).all(axis=1)
-        weight = np.prod(np.where(offset, share, 1 - share), axis=1) * value
-        flat = np.ravel_multi_index(tuple(at[held].T), (n, n, n))
-        result += np.bincount(flat, weight[held], minlength=n**3)
-    return result.reshape(n, n, n) / step**3
+    at = np.floor(place).astype(int)[:, None] + CORNERS
+    weight = np.prod(1 - np.abs(at - place[:, None]), axis=2) * value[:, None]
+    held = ((at >= 0) & (at < n)).all(axis=2)
+    flat = np.ravel_multi_index(tuple(at[held].T), (n, n, n))
+    return np.bincount(flat, weight[held], minlength=n**3).reshape(n, n, n) / step**3
 
 
 def areas(tree: KDTree, normals: Points, neighbours: int) -> Float[np.ndarray, " p"]:

@@ -11,7 +11,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
+from scipy.ndimage import maximum_filter
 from scipy.spatial import KDTree
 
 from more2_jax.orientation import outward_signs
@@ -19,10 +20,12 @@ from more2_jax.screened_poisson import Grid, areas, screened
 
 NEIGHBOURS = 12  # points of a plane
 ASKED = 8  # planes a query hears
-MOST = 4096  # points that are kept
+MOST = 16_384  # points that are kept
 GAP = 3.0  # median distances between neighbours
 LEAST_GAP = 1e-3  # canonical units; where points are doubled
 FEWEST = NEIGHBOURS + 1  # fewer make no surface
+SMOOTH = 0.15  # share of a grid's step: points rougher than this do not resolve it
+FARTHEST = 1.5  # reaches from a plane, and gaps along it, beyond which it has no say
 ONE_FACE = 4  # power of the cosine to the nearest plane's normal: the other face of a thin board is not heard
 
 Points = Float[np.ndarray, "_ 3"]
@@ -37,13 +40,24 @@ class SeenSurface:
     normal: Points  # unit length, outward
     reach: float  # off a plane, at this distance, its say has fallen to 1/e
     gap: float  # and along it, at this distance from the nearest point: it also holds between neighbours
+    roughness: float  # how far off the planes their points lie, typically
+
+    @property
+    def farthest(self) -> float:
+        """From a seen point, what lies farther away is not drawn."""
+        return FARTHEST * float(np.hypot(self.reach, self.gap))
+
+    def resolves(self, step: float) -> bool:
+        """Whether the points are so exact that a grid of this step has something to tell."""
+        return self.roughness < SMOOTH * step
 
     def corrected(self, queries: Points, field: Float[np.ndarray, " _"]) -> Float[np.ndarray, " _"]:
         """Field values at queries, drawn towards the distance from the planes; signed, canonical units."""
         result = np.array(field, np.float64)
         # The nearest alone first: most of a grid is out of reach, and stays as it is.
-        farthest = 2 * float(np.hypot(self.reach, self.gap))
-        near = np.flatnonzero(self.tree.query(queries, distance_upper_bound=farthest, workers=-1)[0] < np.inf)
+        near = np.flatnonzero(
+            self.tree.query(queries, distance_upper_bound=self.farthest, workers=-1)[0] < np.inf
+        )
         if not len(near):
             return result
         distance, index = self.tree.query(queries[near], k=ASKED, workers=-1)
@@ -58,22 +72,38 @@ class SeenSurface:
         result[near] += say * (plane - result[near])
         return result
 
+    def near(self, half: float, cells: int) -> Bool[np.ndarray, "n n n"]:
+        """The corners of a cube's grid that may be near enough to a seen point to be drawn."""
+        step = 2 * half / cells
+        corner = np.rint((np.asarray(self.tree.data) + half) / step).astype(int)
+        held = corner[((corner >= 0) & (corner <= cells)).all(axis=1)]
+        seen = np.zeros([cells + 1] * 3, bool)
+        seen[tuple(held.T)] = True
+        return maximum_filter(seen, size=2 * int(np.ceil(self.farthest / step + 0.5)) + 1)
+
     def screened(self, field: Grid, half: float, length: float) -> Grid:
         """The field on a cube's grid, its sides near what was seen put right; `length`: how far that reaches."""
         area = areas(self.tree, self.normal, NEIGHBOURS)
         return screened(field, half, np.asarray(self.tree.data), self.normal, area, length)
 
 
-def some_of(points: Points) -> Points:
-    """At most `MOST` of the points, at even steps."""
-    return points[np.linspace(0, len(points) - 1, min(len(points), MOST)).astype(int)]
+def some_of(points: Float[np.ndarray, "n *_"], most: int = MOST) -> Float[np.ndarray, "m *_"]:
+    """At most `most` of the points, or of what belongs to them, at even steps."""
+    return points[np.linspace(0, len(points) - 1, min(len(points), most)).astype(int)]
 
 
-def seen_surface(points: Points, slope: Points, reach: float, lowest: float = -np.inf) -> SeenSurface | None:
+def seen_surface(
+    points: Points,
+    slope: Points,
+    reach: float,
+    lowest: float = -np.inf,
+    seen_from: Float[np.ndarray, "p s 3"] | None = None,
+) -> SeenSurface | None:
     """Planes through each point's neighbours, outward. None if there are too few points.
 
-    `slope` is the field's gradient at the points, which has a say in what is outward; both in canonical units,
-    relative to the object's centre. Below the height `lowest` there is no free space.
+    `slope` is the field's gradient at the points, which has a say in what is outward; one of the places `seen_from`
+    saw a point, if they are known (NaN fills up). All in canonical units, relative to the object's centre. Below the
+    height `lowest` there is no free space.
     """
     if len(points) < FEWEST:
         return None
@@ -81,9 +111,10 @@ def seen_surface(points: Points, slope: Points, reach: float, lowest: float = -n
     apart, neighbours = tree.query(points, k=NEIGHBOURS, workers=-1)
     center = points[neighbours].mean(axis=1)
     offset = points[neighbours] - center[:, None]
-    normal = np.linalg.eigh(np.einsum("nki,nkj->nij", offset, offset))[1][:, :, 0]
+    spread, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", offset, offset) / NEIGHBOURS)
+    normal, roughness = axes[:, :, 0], float(np.sqrt(max(0.0, np.median(spread[:, 0]))))
     around = slope[neighbours].sum(axis=1)
     rise = np.einsum("ni,ni->n", normal, around) / np.maximum(np.linalg.norm(around, axis=1), 1e-9)
     gap = GAP * max(float(np.median(apart[:, 1])), LEAST_GAP)
-    signs = outward_signs(tree, normal, rise, gap, lowest)
-    return SeenSurface(tree, center, signs[:, None] * normal, reach, gap)
+    signs = outward_signs(tree, normal, rise, gap, lowest, seen_from)
+    return SeenSurface(tree, center, signs[:, None] * normal, reach, gap, roughness)

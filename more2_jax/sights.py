@@ -1,4 +1,4 @@
-"""What sensors saw around the instances of a new scan, and around the objects of a living scene."""
+"""What sensors saw of and around the instances of a new scan, and the objects of a living scene."""
 
 from __future__ import annotations
 
@@ -6,11 +6,12 @@ import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
+from jaxtyping import Float
 
 from more2_jax.metrics import apply_pose
 from more2_jax.objects import Points, accumulated, accumulated_points, points_of
 from more2_jax.sight import moved_sight, sight_of, spread, stacked, view_of
-from more2_jax.types import Instance, Scan, ScanRecord, SceneObject, Sight
+from more2_jax.types import Instance, Observation, Scan, ScanRecord, SceneObject, Sight
 
 SENSORS = 64  # of a scan that are remembered
 
@@ -51,3 +52,24 @@ def _object_sight(o: SceneObject, scans: Sequence[ScanRecord], rooms: dict[int, 
         if view is not None:
             views.append(moved_sight(view, seen.T_ref_scan))
     return stacked(views)
+
+
+def seen_from(o: SceneObject, scans: Sequence[ScanRecord]) -> Float[np.ndarray, "n s 3"] | None:
+    """Of every accumulated point, the places of the sensors that may have seen it, in the object's frame.
+
+    `VIEWS` of a scan at most; NaN fills up. None where no sensor is known.
+    """
+    eyes = {seen.scan: _eyes(o, seen, scans[seen.scan]) for seen in accumulated(o)}
+    most = max(len(e) for e in eyes.values())
+    if not most:
+        return None
+    of_scan = np.full((max(eyes) + 1, most, 3), np.nan)
+    for scan, places in eyes.items():
+        of_scan[scan, : len(places)] = places
+    return of_scan[o.point_scan[np.isin(o.point_scan, list(eyes))]]
+
+
+def _eyes(o: SceneObject, seen: Observation, scan: ScanRecord) -> Points:
+    """The sensors of an observation that lie farthest apart, in the object's frame."""
+    places = apply_pose(seen.T_ref_scan, scan.sensors)
+    return places[spread(list(places), accumulated_points(o).mean(axis=0))]

@@ -6,7 +6,7 @@ import trimesh
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
-from more2_jax.orientation import FARTHEST, first_met, outward_signs
+from more2_jax.orientation import FARTHEST, VOTERS, first_met, outward_signs, side_seen
 
 GAP = 0.05
 
@@ -89,3 +89,66 @@ def test_the_first_point_met_is_told_to_a_third():
 def test_points_on_one_spot_are_no_error():
     found = outward_signs(KDTree(np.zeros((30, 3))), np.tile([0.0, 0, 1], (30, 1)), np.ones(30), GAP, -np.inf)
     assert set(found) <= {-1.0, 1.0}
+
+
+def from_places(points, *places):
+    return np.broadcast_to(np.array(places, float), (len(points), len(places), 3))
+
+
+def sheet(z=0.0, count=1500):
+    rng = np.random.default_rng(0)
+    points = np.column_stack([rng.uniform(-0.4, 0.4, (count, 2)), np.full(count, z)])
+    return points, np.tile([0.0, 0.0, 1.0], (count, 1))
+
+
+def test_a_surface_faces_its_only_sensor():
+    points, up = sheet()
+    normals, sign = flipped(up)
+    for height in (2.0, -2.0):
+        seen = side_seen(KDTree(points), points, normals, from_places(points, [0.3, 0.1, height]), GAP)
+        np.testing.assert_array_equal(seen, np.sign(height) * sign)
+
+
+def test_what_is_hidden_from_a_sensor_was_seen_by_another():
+    """Two sheets, 0.2 apart, and a sensor on either side: each sheet hides the other from one of them."""
+    (above, up), (below, _) = sheet(0.1), sheet(-0.1)
+    points = np.concatenate([above, below])
+    places = from_places(points, [0.0, 0, 2.0], [0.0, 0, -2.0])
+    seen = side_seen(KDTree(points), points, np.concatenate([up, up]), places, GAP)
+    inner = np.abs(points[:, :2]).max(axis=1) < 0.3
+    assert (seen[: len(above)][inner[: len(above)]] == 1).all()
+    assert (seen[len(above) :][inner[len(above) :]] == -1).all()
+
+
+def test_sensors_that_nothing_hides_on_both_sides_say_nothing():
+    points, up = sheet()
+    seen = side_seen(KDTree(points), points, up, from_places(points, [0.0, 0, 2.0], [0.0, 0, -2.0]), GAP)
+    np.testing.assert_allclose(seen, 0.0, atol=1e-12)
+
+
+def test_unknown_places_and_a_sensor_at_the_point_say_nothing():
+    points, up = sheet()
+    nowhere = np.full((len(points), 2, 3), np.nan)
+    assert not side_seen(KDTree(points), points, up, nowhere, GAP).any()
+    assert not side_seen(KDTree(points), points, up, points[:, None], GAP).any()
+    filled = nowhere.copy()
+    filled[:, 1] = [0.0, 0, 2.0]
+    assert (side_seen(KDTree(points), points, up, filled, GAP) == 1).all()
+
+
+def test_of_many_points_some_look_around_and_the_rest_hears_them():
+    points, true = surface_of(shelf(), 3 * VOTERS)
+    normals, sign = flipped(true)
+    assert (outward_signs(KDTree(points), normals, 0.0 * sign, GAP, -np.inf) == sign).mean() > 0.95
+
+
+def test_a_sensor_outweighs_field_and_surroundings():
+    """The inner faces of a box without a lid, seen from above: for the field, and for what lies behind, solid."""
+    box = trimesh.creation.box([0.5, 0.5, 0.5])
+    points, true = surface_of(box)
+    inside = points[points[:, 2] < 0.249]
+    normals, sign = flipped(-true[points[:, 2] < 0.249])
+    places = from_places(inside, [0.0, 0.0, 0.8])
+    args = (KDTree(inside), normals, -sign, GAP, -np.inf)
+    assert (outward_signs(*args, places) == sign).mean() > 0.97
+    assert (outward_signs(*args) == sign).mean() < 0.5

@@ -1,5 +1,7 @@
 """What was seen: the surface runs through it, the rest stays the field's; nothing depends on the frame."""
 
+import dataclasses
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -135,7 +137,7 @@ def test_points_without_a_plane_give_finite_values(points):
 
 
 def test_at_most_so_many_points_are_kept_from_first_to_last():
-    points = np.arange(3 * 10_000.0).reshape(-1, 3)
+    points = np.arange(3 * (MOST + 5000.0)).reshape(-1, 3)
     kept = some_of(points)
     assert len(kept) == MOST and (kept[[0, -1]] == points[[0, -1]]).all()
     np.testing.assert_array_equal(some_of(points[:10]), points[:10])
@@ -155,3 +157,55 @@ def test_what_was_seen_is_drawn_finer_than_the_field_is_asked(ball_of_036, tiny_
     assert (
         np.quantile(off, 0.9) < 0.005
     )  # half a wave's height; the ball that the field believes in is 0.01 off
+
+
+def test_every_corner_that_is_drawn_is_near():
+    surface = seen_surface(
+        sphere(2000, 0.3) + [0.25, 0, 0], sphere(2000, 0.3), REACH
+    )  # partly beyond the grid
+    half, cells = 0.45, 36
+    near, axis = surface.near(half, cells), np.linspace(-half, half, cells + 1)
+    corners = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
+    drawn = surface.corrected(corners, np.full(len(corners), 5.0)) != 5.0
+    assert drawn.any() and near.ravel()[drawn].all() and near.mean() < 0.5
+
+
+@pytest.mark.parametrize(("noise", "finer"), [(0.0, True), (0.02, False)])
+def test_a_grid_is_as_fine_as_the_points_are_exact(ball_of_036, tiny_prior, noise, finer, monkeypatch):
+    grids = []
+    monkeypatch.setattr(meshing, "_sided", lambda *a, sided=meshing._sided: grids.append(a[-1]) or sided(*a))
+    seen = sphere(6000, 0.4) * (1 + noise * np.random.default_rng(0).normal(size=(6000, 1)))
+    config = dataclasses.replace(CONFIG, resolution=64, field_resolution=16, screening=0.1)
+    mesh = extract_mesh(tiny_prior, PIECE, config, seen=in_scan(seen))
+    assert grids == [64 if finer else 32]
+    radius = np.linalg.norm(in_canonical(mesh.vertices), axis=1)
+    assert abs(np.median(radius) - 0.4) < 0.004 + noise / 4
+
+
+def bowl():
+    """The inner half of a hollow ball of radius 0.4, seen alone: what lies behind it says nothing."""
+    p = sphere(3000, 0.4)
+    return p[p[:, 2] < 0]
+
+
+@pytest.mark.parametrize(("eye", "outward"), [([0.0, 0.0, 3.0], -1.0), ([0.0, 0.0, -3.0], 1.0)])
+def test_a_sheet_faces_who_saw_it_whatever_the_field_says(eye, outward):
+    points = bowl()
+    places = np.full((len(points), 2, 3), np.nan)
+    places[:, 0] = eye
+    for field in (1.0, -1.0):
+        found = seen_surface(points, field * points, REACH, seen_from=places)
+        facing = outward * np.einsum("ni,ni->n", found.normal, points) > 0
+        assert facing.mean() > 0.99
+
+
+def test_a_mesh_is_told_who_saw_its_points(ball_of_036, tiny_prior):
+    """A shell that the field takes for a ball: seen from within, its inside is free."""
+    within = sphere(4000, 0.3)
+    config = dataclasses.replace(CONFIG, field_resolution=32, screening=0.15)
+    places = np.broadcast_to(in_scan(np.zeros(3)), (len(within), 1, 3))
+    shell = extract_mesh(tiny_prior, PIECE, config, seen=in_scan(within), seen_from=places)
+    whole = extract_mesh(tiny_prior, PIECE, config, seen=in_scan(within))
+    asked = in_scan(np.array([[0.0, 0, 0], [0.33, 0, 0]]))
+    for mesh, solid in ((shell, [False, True]), (whole, [True, False])):
+        assert list(trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).contains(asked)) == solid

@@ -33,7 +33,7 @@ from more2_jax.sight import (
     sight_of,
     spread,
 )
-from more2_jax.sights import objects_with_sight
+from more2_jax.sights import objects_with_sight, seen_from
 from more2_jax.starts import Pair
 from more2_jax.surface_registration import CLEARLY, freed
 from more2_jax.types import Embedding, Instance, Scan
@@ -259,6 +259,24 @@ def test_an_objects_views_are_of_all_that_make_up_its_shape(tiny_prior):
     )
     (one,) = objects_with_sight([doubted], records)
     np.testing.assert_allclose(one.sight.eye, sensors)
+    count = len(doubted.points) // 2
+    np.testing.assert_allclose(seen_from(doubted, records), np.tile(sensors, (count, 1, 1)))
+    places = seen_from(twice, records)
+    np.testing.assert_allclose(places[[0, count - 1], 0], [[0.0, -4.0, 1.5]] * 2)
+    np.testing.assert_allclose(places[[count, -1], 0], [[-0.5, -4.0, 1.5]] * 2)
+
+
+def test_a_scan_without_sensors_leaves_its_points_without_places(tiny_prior):
+    three = np.array([[0.0, -4.0, 1.5], [1.0, -4.0, 1.5], [2.0, -4.0, 1.5]])
+    scene = start_scene(tiny_prior, scan_of("a", np.zeros(3), three), ROBUST)
+    o, records = scene.objects[0], scene.scans
+    unknown = dataclasses.replace(records[0], index=1, sensors=np.zeros((0, 3)))
+    again = dataclasses.replace(o.observations[0], scan=1)
+    both = seen_again(o, Instance(id=1, points=o.points), again)
+    places = seen_from(both, (*records, unknown))
+    assert places.shape == (len(both.points), 3, 3)
+    assert np.isfinite(places[both.point_scan == 0]).all() and np.isnan(places[both.point_scan == 1]).all()
+    assert seen_from(o, (unknown,)) is None
 
 
 # --- where the places come from -----------------------------------------------------------------------------
