@@ -50,11 +50,7 @@ def extract_mesh(
     when the field stays above `level` in the box: there is no surface to show. Raises ValueError unless
     `resolution` is `coarse` doubled some times.
     """
-    doublings = np.log2(config.resolution / config.coarse)
-    if doublings < 0 or doublings != int(doublings):
-        raise ValueError(
-            f"resolution {config.resolution} from coarse {config.coarse}; needed a power of two times it"
-        )
+    _check(config)
     half = half_width or config.half_width
     lowest = -np.inf if floor is None else canonical(embedding, np.array([[0.0, 0.0, floor]]))[0, 2]
     through = surface_through(prior, embedding, seen, config, lowest, seen_from)
@@ -67,14 +63,21 @@ def extract_mesh(
     asked = config.field_resolution or config.resolution
     while len(values) - 1 < config.resolution:
         if through is not None and config.screening and len(values) - 1 == asked:
-            exact = through.resolves(2 * half / config.resolution)
-            cells = config.resolution if exact else 2 * asked
-            field, values = _sided(through, config.screening, lowest, field, half, cells)
-            continue
-        field, values = _refine(ask if 2 * (len(values) - 1) <= asked else None, draw, field, values, half)
+            field, values = _sided(through, config, lowest, field, half)
+        else:
+            finer = ask if 2 * (len(values) - 1) <= asked else None
+            field, values = _refine(finer, draw, field, values, half)
     if not (values < 0).any():
         return None
     return _surface(values, embedding, 2 * half / (len(values) - 1), half)
+
+
+def _check(config: MeshingConfig) -> None:
+    doublings = np.log2(config.resolution / config.coarse)
+    if doublings < 0 or doublings != int(doublings):
+        raise ValueError(
+            f"resolution {config.resolution} from coarse {config.coarse}; needed a power of two times it"
+        )
 
 
 def surface_through(
@@ -173,17 +176,21 @@ def _refine(
 
 def _sided(
     through: SeenSurface,
-    screening: float,
+    config: MeshingConfig,
     lowest: float,
     field: Float[np.ndarray, "n n n"],
     half: float,
-    cells: int,
 ) -> tuple[Float[np.ndarray, "m m m"], Float[np.ndarray, "m m m"]]:
-    """Field and values on a finer grid: inside and outside as what was seen has them, near it."""
+    """Field and values on a finer grid: inside and outside as what was seen has them, near it.
+
+    With half the step, or the last grid's if what was seen is exact enough for it.
+    """
+    exact = through.resolves(2 * half / config.resolution)
+    cells = config.resolution if exact else 2 * (len(field) - 1)
     while len(field) - 1 < cells:
         field = doubled(field)
     below = lowest - np.linspace(-half, half, cells + 1)
-    field = through.screened(np.maximum(field, below), half, screening)
+    field = through.screened(np.maximum(field, below), half, config.screening)
     near, values = through.near(half, cells), field.copy()
     values[near] = through.corrected(np.argwhere(near) * (2 * half / cells) - half, field[near])
     return field, np.maximum(values, below)

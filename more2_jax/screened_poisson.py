@@ -43,19 +43,19 @@ def screened(
     size = next_fast_len(n + int(np.ceil(MARGIN * length / step)), real=True) or n
     k = [2 * np.pi * f(size, step) for f in (np.fft.fftfreq, np.fft.fftfreq, np.fft.rfftfreq)]
     waves = np.meshgrid(*(x.astype(np.float32) for x in k), indexing="ij", sparse=True)
-    squared = sum(w**2 for w in waves)
+    squared = waves[0] ** 2 + waves[1] ** 2 + waves[2] ** 2
     # Both gradients as smooth as the grid can hold, or as the points are dense.
     width = max(step, np.sqrt(float(np.median(area))))
     flux = [splat(points, -area * normals[:, i], half, n) for i in range(3)]
     divergence = sum(np.complex64(1j) * w * transform(v, size) for w, v in zip(waves, flux, strict=True))
     change = -squared * smooth(squared, step) * transform(prior, size) - smooth(squared, width) * divergence
-    change = irfftn(change / (squared + np.float32(length**-2)), s=[size] * 3, workers=-1)
+    change = np.asarray(irfftn(change / (squared + np.float32(length**-2)), s=[size] * 3, workers=-1))
     return (0.5 - prior - change[:n, :n, :n]) * 2 * SOFT * step
 
 
 def transform(x: Grid, size: int) -> np.ndarray:
     """Fourier transform of a grid with empty space after it, single precision."""
-    return rfftn(x.astype(np.float32), s=[size] * 3, workers=-1)
+    return np.asarray(rfftn(x.astype(np.float32), s=[size] * 3, workers=-1))
 
 
 def smooth(squared: np.ndarray, width: float) -> np.ndarray:

@@ -172,8 +172,14 @@ def test_every_corner_that_is_drawn_is_near():
 
 @pytest.mark.parametrize(("noise", "finer"), [(0.0, True), (0.02, False)])
 def test_a_grid_is_as_fine_as_the_points_are_exact(ball_of_036, tiny_prior, noise, finer, monkeypatch):
-    grids = []
-    monkeypatch.setattr(meshing, "_sided", lambda *a, sided=meshing._sided: grids.append(a[-1]) or sided(*a))
+    grids, sided = [], meshing._sided
+
+    def noted(*asked):
+        found = sided(*asked)
+        grids.append(len(found[1]) - 1)
+        return found
+
+    monkeypatch.setattr(meshing, "_sided", noted)
     seen = sphere(6000, 0.4) * (1 + noise * np.random.default_rng(0).normal(size=(6000, 1)))
     config = dataclasses.replace(CONFIG, resolution=64, field_resolution=16, screening=0.1)
     mesh = extract_mesh(tiny_prior, PIECE, config, seen=in_scan(seen))
