@@ -22,7 +22,7 @@ from eval.matching import record as match_record
 from eval.mesh_scores import RECONSTRUCTED, mesh_scores
 from eval.options import Options
 from eval.pose_scores import pose_scores
-from eval.reconstruction import Seen, embedded, fitted_in_batches, mesh_seen, seen_objects
+from eval.reconstruction import Seen, embedded, fitted_in_batches, mesh_seen, seen_objects, with_joint
 from eval.registration import own_records, own_settings, true_pairs
 from eval.results import finish
 from eval.runs import run_scenes, start_run
@@ -141,7 +141,7 @@ def joint_study(
     start = registered(prior, seen, embedded(prior, seen, o.batch), config, o.batch)
     found = joint_records(seen, start, prior, config, "joint: nothing", o.samples)
     for name, freed in FREED.items():
-        own = dataclasses.replace(config, joint=only(config.joint, freed))
+        own = dataclasses.replace(config, joint=only(with_joint(config).joint, freed))
         fitted = fitted_in_batches(prior, start, own, o.batch)
         found += joint_records(seen, fitted, prior, config, f"joint: {name}", o.samples)
     return found

@@ -8,6 +8,7 @@ program's business.
 
 from __future__ import annotations
 
+import dataclasses
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -26,7 +27,7 @@ from eval.peers.reconstruction import SURFACERS, Surfacer
 from eval.results import finish
 from eval.runs import run_scenes, start_run
 from eval.truth import KnownObject, KnownScene
-from more2_jax.config import SceneConfig
+from more2_jax.config import SceneConfig, preset
 from more2_jax.fitting import fit_objects
 from more2_jax.metrics import apply_pose
 from more2_jax.prior import Prior
@@ -48,6 +49,8 @@ class Settings(Options):
 def _of(name: str, key: str, column: Column, **more: object) -> Figure:
     return replace(Figure(name=name, key=key, statistic="mean", column=column), **more)  # pyright: ignore[reportArgumentType]
 
+
+JOINT_STEPS = 40  # where the preset has none
 
 PERCENT = {"unit": "%", "scale": 100.0}
 LENGTH = {"unit": "cm", "scale": 100.0, "better": "lower"}
@@ -75,16 +78,26 @@ FIGURES = [
 def main(options: Annotated[Settings, tyro.conf.arg(name="")]) -> None:
     """Meshes of the method with and without joint optimisation, and of what one would use instead."""
     peers = SURFACERS if options.peers else {}
-    stated = {"methods": [*own_names(options.preset), *peers], "scans": options.scans}
+    stated = {"methods": [*own_names(options.preset, preset(options.preset)), *peers], "scans": options.scans}
     current = start_run("reconstruction", options, {**stated, "samples": options.samples})
 
     records = run_scenes(current, options, lambda s: work(s, current.prior, current.config, peers, options))
     finish(current, options, FIGURES, records, ("category",))
 
 
-def own_names(name: str) -> tuple[str, str]:
-    """Of a single observation, the optimisation is that of its code."""
-    return f"ours, {name}", f"ours, {name}, without optimisation"
+def own_names(preset: str, config: SceneConfig) -> tuple[str, str]:
+    """The preset's, and the same with or without the joint optimisation, whichever the preset is not.
+
+    Of a single observation, the optimisation is that of its code.
+    """
+    without = "without optimisation" if config.joint.steps else "with joint optimisation"
+    return f"ours, {preset}", f"ours, {preset}, {without}"
+
+
+def with_joint(config: SceneConfig) -> SceneConfig:
+    """The settings with joint optimisation, where the preset has none."""
+    joint = dataclasses.replace(config.joint, steps=config.joint.steps or JOINT_STEPS)
+    return dataclasses.replace(config, joint=joint)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -133,10 +146,11 @@ def work(
     """All objects of some scenes: encoded, and optimised, together; then one mesh after the other."""
     seen = seen_objects(scenes, o.scans)
     plain, encoding_s = timed(lambda: embedded(prior, seen, o.batch), len(seen))
-    fitted, fitting_s = timed(lambda: fitted_in_batches(prior, plain, config, o.batch), len(seen))
-    with_it, without = own_names(o.preset)
+    fitted, fitting_s = timed(lambda: fitted_in_batches(prior, plain, with_joint(config), o.batch), len(seen))
+    both = [(fitted, encoding_s + fitting_s), (plain, encoding_s)]
+    names = own_names(o.preset, config)
     records = []
-    for name, objects, spent_s in ((with_it, fitted, encoding_s + fitting_s), (without, plain, encoding_s)):
+    for name, (objects, spent_s) in zip(names, both if config.joint.steps else both[::-1], strict=True):
         records += [
             scored(s, name, lambda s=s, own=own: mesh_seen(prior, s, own, config), spent_s, o.samples)
             for s, own in zip(seen, objects, strict=True)

@@ -245,7 +245,8 @@ def preset(name: str, *, upright: bool = False) -> SceneConfig:
                 screening=0.12,
                 floor=True,
             ),
-            joint=JointConfig(points=128, start="accumulated", steps=40, eqv_learning_rate=1e-3),
+            # No step: after alignment by surfaces it buys neither poses nor meshes (docs/design_notes.md).
+            joint=JointConfig(points=128, start="accumulated", steps=0, eqv_learning_rate=1e-3),
         )
     raise ValueError(f"preset {name!r}; needed 'paper' or 'robust'")
 

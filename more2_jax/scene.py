@@ -104,13 +104,12 @@ def reconstruct(
 ) -> LivingScene:
     """Optimises code and poses of every object seen more than once, all in one call, then extracts meshes.
 
-    Observations in doubt (`Observation.accumulated` False) have no part in it.
-
-    Objects that have a mesh have not changed since and are left alone.
+    With no `joint.steps`, as in `robust`, meshes alone. Observations in doubt (`Observation.accumulated` False) have
+    no part in it. Objects that have a mesh have not changed since and are left alone.
     """
     timing, objects = dict(scene.timing_s), list(scene.objects)
     todo = [k for k, o in enumerate(objects) if o.mesh is None]
-    again = [k for k in todo if len(accumulated(objects[k])) > 1]
+    again = [k for k in todo if config.joint.steps and len(accumulated(objects[k])) > 1]
     with staged(timing, progress, "joint", len(again)):
         objects = fit_objects(prior, objects, again, config)
     with staged(timing, progress, "mesh", len(todo)) as advance:
