@@ -46,13 +46,16 @@ def outward_signs(
     is the least way that counts; below the height `lowest` there is no free space. One of the places `seen_from`, if
     they are known, saw the point; NaN fills up.
     """
-    points, few = np.asarray(tree.data), slice(None, None, -(-tree.n // VOTERS))
-    ways = [first_met(tree, points[few], side * normal[few], gap, lowest) for side in (1, -1)]
-    vote = OF_FIELD * np.clip(slope, -1, 1)
-    vote[few] += np.clip(np.log(ways[0] / ways[1]), -1, 1)
+    points, few = np.asarray(tree.data), np.arange(0, tree.n, -(-tree.n // VOTERS))
+    seen = np.zeros(len(few))
     if seen_from is not None:
-        vote *= OF_SURROUNDINGS
-        vote[few] += side_seen(tree, points[few], normal[few], seen_from[few], gap)
+        seen = side_seen(tree, points[few], normal[few], seen_from[few], gap)
+    unsure = few[np.abs(seen) < 1]
+    ways = [first_met(tree, points[unsure], side * normal[unsure], gap, lowest) for side in (1, -1)]
+    vote = OF_FIELD * np.clip(slope, -1, 1)
+    vote[unsure] += np.clip(np.log(ways[0] / ways[1]), -1, 1)
+    vote *= 1.0 if seen_from is None else OF_SURROUNDINGS
+    vote[few] += seen
     agreed, _ = cg(*graph(tree, normal, vote), x0=vote, rtol=1e-3, maxiter=200)
     return np.where(agreed < 0, -1.0, 1.0)
 
