@@ -8,18 +8,23 @@ import jaxlie
 import numpy as np
 import pieces
 import pytest
+from compiling import quick_jit
 from scipy.spatial.transform import Rotation
 
+from more2_jax import surface_registration
 from more2_jax.alignment import whole_surface
 from more2_jax.batching import pad_clouds
 from more2_jax.config import preset
 from more2_jax.geometry import Sampled
 from more2_jax.prior import encode, load_prior, sdf_one
 from more2_jax.starts import Pair
-from more2_jax.surface_registration import ABOUT_AS_WELL, OFF_FIELD, doubts, off_fields
+from more2_jax.surface_registration import ABOUT_AS_WELL, OFF_FIELD
 
 POINTS, COUNT = 512, 64
 CONFIG = preset("robust", upright=True).registration
+off_fields = quick_jit(surface_registration.off_fields, static_argnames="count")
+doubts = quick_jit(surface_registration.doubts, static_argnames="config")
+surface_of = quick_jit(whole_surface)
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +46,7 @@ def pair_of(prior, source, target):
     pair = Pair(
         source=clouds[0], target=clouds[1], source_code=codes[0], target_code=codes[1], offset=jnp.zeros(3)
     )
-    return pair, [whole_surface(c.points, c.mask) for c in clouds]
+    return pair, [surface_of(c.points, c.mask) for c in clouds]
 
 
 def poses_of(*matrices):
