@@ -18,7 +18,7 @@ LIMIT_S = 300  # a minute on two quiet cores; machines are not always quiet
 @pytest.fixture(scope="session")
 def printed(tmp_path_factory):
     """What an example prints, by its number; compiled programs are shared."""
-    cache = str(tmp_path_factory.mktemp("compiled"))
+    cache = os.environ.get("JAX_COMPILATION_CACHE_DIR") or str(tmp_path_factory.mktemp("compiled"))
     away = tmp_path_factory.mktemp("away")
 
     def run(number: int) -> str:

@@ -44,9 +44,9 @@ def commands(page: Path) -> list[str]:
 
 @pytest.fixture(scope="session", autouse=True)
 def _compiled_once(tmp_path_factory):
-    """Pages share compiled programs within the session, and with nothing else."""
+    """Pages share compiled programs within the session, or wherever all tests do."""
     before = jax.config.values["jax_compilation_cache_dir"]
-    jax.config.update("jax_compilation_cache_dir", str(tmp_path_factory.mktemp("compiled")))
+    jax.config.update("jax_compilation_cache_dir", before or str(tmp_path_factory.mktemp("compiled")))
     yield
     jax.config.update("jax_compilation_cache_dir", before)
 
