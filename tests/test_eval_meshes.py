@@ -10,9 +10,11 @@ from scipy.spatial.distance import cdist
 
 from eval.accumulation import coverage
 from eval.mesh_scores import KEYS, enclosed, f_score, mesh_scores, no_mesh, surface_points
+from eval.reconstruction import JOINT_STEPS, own_names, with_joint
 from eval.symmetry import SymmetryGroup
 from eval.tracks import Track, changes_f1, score_tracks
 from eval.truth import KnownObject
+from more2_jax.config import preset
 from more2_jax.types import Mesh
 
 SAMPLES = 3000
@@ -181,3 +183,11 @@ def test_an_object_without_a_mask_has_failed_but_not_as_published():
     found = score_tracks(scene, [true_track(o) for o in SCENE.objects], 5.0, 500)
     assert totals(found, "mr.strict") == (7, 8)
     assert [r["mr.published"] for r in found if "mr.published" in r] == [1.0] * 7
+
+
+def test_a_preset_is_measured_with_and_without_joint_optimisation():
+    paper, robust = preset("paper"), preset("robust")
+    assert own_names("paper", paper) == ("ours, paper", "ours, paper, without optimisation")
+    assert own_names("robust", robust) == ("ours, robust", "ours, robust, with joint optimisation")
+    assert with_joint(paper) == paper
+    assert with_joint(robust).joint == dataclasses.replace(robust.joint, steps=JOINT_STEPS)

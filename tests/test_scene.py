@@ -157,6 +157,16 @@ def test_reconstruction_gives_closed_frames_and_leaves_finished_objects_alone(ti
     assert all(a is b for a, b in zip(again.objects, marked.objects, strict=True))
 
 
+def test_without_joint_steps_codes_and_poses_stay_and_with_them_they_do_not(tiny_prior, scene):
+    """The preset `robust` has none; `CONFIG` has three."""
+    without = dataclasses.replace(CONFIG, joint=ROBUST.joint)
+    stayed, moved = (reconstruct(tiny_prior, scene, c) for c in (without, CONFIG))
+    assert ROBUST.joint.steps == 0
+    for before, after, other in zip(scene.objects, stayed.objects, moved.objects, strict=True):
+        assert after.embedding is before.embedding and after.observations is before.observations
+        assert (other.embedding is not before.embedding) == (len(before.observations) > 1)
+
+
 def test_another_scene_of_like_size_compiles_nothing_new(tiny_prior, scene):
     before = registration._register_many._cache_size()
     other = start_scene(tiny_prior, scan("d", {0: (2.0, 0.0), 1: (0.0, 3.0), 2: (1.0, 7.0)}), CONFIG)
