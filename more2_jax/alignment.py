@@ -16,7 +16,7 @@ import jaxlie
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
-from more2_jax.geometry import FAR, Sampled, nearest_index, thin
+from more2_jax.geometry import FAR, Sampled, nearest_index, thin, transformed
 from more2_jax.nearest_grid import NearestGrid, look_up, nearest_grid, scale_grid
 from more2_jax.types import pytree
 
@@ -152,10 +152,10 @@ def correspondences(T: jaxlie.SE3, source: Surface, target: Surface) -> Correspo
     """Every sample's nearest point on the other cloud."""
     R = T.rotation().as_matrix()
     s, t = source.sampled, target.sampled
-    points = T @ s.points
+    points = transformed(T, s.points)
     there = closest(target, points)
-    back = closest(source, T.inverse() @ t.points)
-    a = jnp.concatenate([points, T @ s.dense[back]])
+    back = closest(source, transformed(T.inverse(), t.points))
+    a = jnp.concatenate([points, transformed(T, s.dense[back])])
     b = jnp.concatenate([t.dense[there], t.points])
     real = jnp.concatenate([s.mask & t.dense_mask[there], t.mask & s.dense_mask[back]])
     return Correspondences(
@@ -190,33 +190,47 @@ def normal_equations(
 ) -> NormalEquations:
     """Linearised at `T`; a correspondence as far apart as `reach` counts a quarter, one of crossed surfaces not."""
     c = correspondences(T, source, target)
-    agree = jnp.sum(c.source_normal * c.target_normal, axis=-1)
-    normal = c.target_normal + jnp.where(agree < 0, -1.0, 1.0)[:, None] * c.source_normal
-    normal = normal / jnp.sqrt(jnp.maximum(jnp.sum(normal**2, axis=-1, keepdims=True), 1e-12))
+    # Components first: sums over many points are then products of matrices with long rows, which are fast.
+    points, gap = c.source.T, c.target.T - c.source.T
+    own, other = c.source_normal.T, c.target_normal.T
+    agree = jnp.sum(own * other, axis=0)
+    normal = other + jnp.where(agree < 0, -1.0, 1.0) * own
+    normal = normal / jnp.sqrt(jnp.maximum(jnp.sum(normal**2, axis=0), 1e-12))
     weight = jnp.where(c.squared < FAR, (reach**2 / (reach**2 + c.squared)) ** 2 * agree**2, 0.0)
     total = weight.sum()
     weight = weight / jnp.maximum(total, 1e-12)
-    gap = c.target - c.source
-    off = jnp.sum(normal * gap, axis=-1)
-    rows = point_jacobian(c.source)
-    n, a = jnp.sqrt(1 - ALONG) * normal, jnp.sqrt(ALONG)
-    J = jnp.concatenate([jnp.einsum("ni,nij->nj", n, rows)[:, None], a * rows], axis=1).reshape(-1, 6)
-    r = jnp.concatenate([jnp.sqrt(1 - ALONG) * off[:, None], a * gap], axis=1).reshape(-1)
-    weighted = (jnp.repeat(weight, 4)[:, None] * J).T
+    off = jnp.sum(normal * gap, axis=0)
+    leaving = moments(jnp.concatenate([normal, jnp.cross(points, normal, axis=0), off[None]]), weight)
+    matrix, vector = sliding(moments(jnp.concatenate([points, gap, jnp.ones_like(off)[None]]), weight))
     return NormalEquations(
-        matrix=jnp.matmul(weighted, J, precision="highest"),
-        vector=jnp.matmul(weighted, r, precision="highest"),
-        variance=jnp.sum(weight * off**2),
+        matrix=(1 - ALONG) * leaving[:6, :6] + ALONG * matrix,
+        vector=(1 - ALONG) * leaving[:6, 6] + ALONG * vector,
+        variance=leaving[6, 6],
         count=total,
     )
 
 
-def point_jacobian(points: Float[Array, "n 3"]) -> Float[Array, "n 3 6"]:
-    """d(p + v + ω × p) / d(v, ω)."""
-    x, y, z = points.T
-    zero = jnp.zeros_like(x)
-    turn = jnp.stack([zero, z, -y, -z, zero, x, y, -x, zero], axis=-1).reshape(-1, 3, 3)
-    return jnp.concatenate([jnp.broadcast_to(jnp.eye(3, dtype=points.dtype), turn.shape), turn], axis=-1)
+def moments(rows: Float[Array, "k n"], weight: Float[Array, " n"]) -> Float[Array, "k k"]:
+    """Weighted sums of the products of any two rows."""
+    return jnp.matmul(rows * weight, rows.T, precision="highest")
+
+
+def sliding(m: Float[Array, "7 7"]) -> tuple[Float[Array, "6 6"], Float[Array, "6"]]:
+    """Point-to-point normal equations from the `moments` of points p, gaps and 1: `Σ w Jᵀ J` and `Σ w Jᵀ gap`.
+
+    J = d(p + v + ω × p) / d(v, ω) = (I, −p×)."""
+    products, mean = m[:3, :3], cross_matrix(m[:3, 6])
+    eye = jnp.eye(3, dtype=m.dtype)
+    matrix = jnp.block([[m[6, 6] * eye, -mean], [mean, jnp.trace(products) * eye - products]])
+    with_gap = m[:3, 3:6]
+    turn = jnp.stack([with_gap[i, j] - with_gap[j, i] for i, j in ((1, 2), (2, 0), (0, 1))])
+    return matrix, jnp.concatenate([m[3:6, 6], turn])
+
+
+def cross_matrix(v: Float[Array, "3"]) -> Float[Array, "3 3"]:
+    """`cross_matrix(v) @ p` is v × p."""
+    zero = jnp.zeros_like(v[0])
+    return jnp.stack([zero, -v[2], v[1], v[2], zero, -v[0], -v[1], v[0], zero]).reshape(3, 3)
 
 
 def free_directions(upright: bool) -> Float[Array, "6"]:

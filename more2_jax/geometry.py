@@ -198,9 +198,17 @@ def cloud_radius(points: Float[Array, "n 3"], mask: Bool[Array, " n"]) -> Float[
     return jnp.sqrt(jnp.maximum(jnp.where(mask, squared, 0.0).max(), 1e-12))
 
 
+def transformed(T_a_b: jaxlie.SE3, points: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
+    """The points in frame a: `T_a_b @ points`, with the rotation's matrix made once and not for every point."""
+    R = T_a_b.rotation().as_matrix()
+    return jnp.matmul(points, R.T, precision="highest") + T_a_b.translation()
+
+
 def move(T_a_b: jaxlie.SE3, cloud: Sampled) -> Sampled:
     """The cloud in frame a."""
-    return dataclasses.replace(cloud, points=T_a_b @ cloud.points, dense=T_a_b @ cloud.dense)
+    return dataclasses.replace(
+        cloud, points=transformed(T_a_b, cloud.points), dense=transformed(T_a_b, cloud.dense)
+    )
 
 
 def icp_step(T: jaxlie.SE3, source: Sampled, target: Sampled, share: float) -> jaxlie.SE3:

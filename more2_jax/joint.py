@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float
 
 from more2_jax.config import JointConfig
 from more2_jax.descent import adam, descend
-from more2_jax.geometry import cloud_radius, farthest_points
+from more2_jax.geometry import cloud_radius, farthest_points, transformed
 from more2_jax.prior import Prior, field_sdf, object_field
 from more2_jax.types import Embedding, JointFit, move_embedding, pytree, scale_embedding
 
@@ -92,7 +92,7 @@ def surface_loss(
     field = object_field(prior, code)
 
     def one(T: jaxlie.SE3, points: Array, mask: Array, real: Array) -> Array:
-        distance = jnp.where(mask, jnp.abs(field_sdf(prior, field, T @ points)), 0.0)
+        distance = jnp.where(mask, jnp.abs(field_sdf(prior, field, transformed(T, points))), 0.0)
         return real * distance.sum() / jnp.maximum(mask.sum(), 1)
 
     return jax.vmap(one)(T_ref_obs, seen.points, seen.mask, seen.real).sum()

@@ -28,6 +28,7 @@ from more2_jax.geometry import (
     icp_step,
     move,
     sample,
+    transformed,
     two_way_rms,
 )
 from more2_jax.prior import Prior, field_sdf, object_field
@@ -187,9 +188,9 @@ def registration_loss(prior: Prior, pair: Pair, config: RegistrationConfig) -> C
     few, few_mask = source.points[: config.sdf_points], source.mask[: config.sdf_points]
 
     def loss(T: jaxlie.SE3) -> Float[Array, ""]:
-        distance = jnp.abs(field_sdf(prior, field, T @ few))
+        distance = jnp.abs(field_sdf(prior, field, transformed(T, few)))
         sdf = jnp.where(few_mask, distance, 0.0).sum() / jnp.maximum(few_mask.sum(), 1)
-        chamfer = chamfer_distance(T @ source.points, source.mask, target.points, target.mask)
+        chamfer = chamfer_distance(transformed(T, source.points), source.mask, target.points, target.mask)
         return config.sdf_weight * sdf + config.chamfer_weight * chamfer
 
     return loss

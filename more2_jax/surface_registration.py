@@ -27,7 +27,7 @@ from more2_jax.alignment import (
     whole_surface,
 )
 from more2_jax.config import RegistrationConfig
-from more2_jax.geometry import FAR, Sampled, move, two_way_rms
+from more2_jax.geometry import FAR, Sampled, move, transformed, two_way_rms
 from more2_jax.prior import Prior, field_sdf, object_field
 from more2_jax.sight import looked_through
 from more2_jax.starts import Pair
@@ -132,7 +132,7 @@ def freed(
         cloud = surface.sampled
 
         def share(T: jaxlie.SE3, sight: Sight = sight, cloud: Sampled = cloud, way: Way = way) -> Array:
-            return looked_through(sight, way(T) @ cloud.points, cloud.mask, CLEARLY)
+            return looked_through(sight, transformed(way(T), cloud.points), cloud.mask, CLEARLY)
 
         cost += config.free_weight / 2 * jax.vmap(share)(poses)
     return cost
@@ -163,7 +163,7 @@ def off_fields(
     source, target = (thinned(s, count).sampled for s in whole)
 
     def one_way(T: jaxlie.SE3, cloud: Sampled, code: Embedding) -> Float[Array, ""]:
-        distance = jnp.abs(field_sdf(prior, object_field(prior, code), T @ cloud.points))
+        distance = jnp.abs(field_sdf(prior, object_field(prior, code), transformed(T, cloud.points)))
         share = jnp.where(cloud.mask, jnp.minimum(distance / OFF_FIELD, 1.0), 0.0)
         mean = share.sum() / jnp.maximum(cloud.mask.sum(), 1)
         return jnp.where(jnp.isfinite(mean), mean, 1.0)

@@ -7,8 +7,16 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from more2_jax.alignment import align, least_axis, point_jacobian, pose_covariance, solve_spd, surface
-from more2_jax.geometry import sample
+from more2_jax.alignment import (
+    align,
+    least_axis,
+    moments,
+    pose_covariance,
+    sliding,
+    solve_spd,
+    surface,
+)
+from more2_jax.geometry import sample, transformed
 from more2_jax.surface_registration import choose, competing, misfit
 
 POINTS = 256
@@ -63,10 +71,24 @@ def test_elimination_solves_what_numpy_solves():
     np.testing.assert_allclose(solve_spd(jnp.asarray(A), jnp.asarray(b)), np.linalg.solve(A, b), rtol=2e-3)
 
 
-def test_jacobian_is_the_derivative_of_a_moved_point():
-    points = jnp.asarray(np.random.default_rng(1).normal(size=(5, 3)), jnp.float32)
-    auto = jax.jacobian(lambda xi: jaxlie.SE3.exp(xi) @ points)(jnp.zeros(6))
-    np.testing.assert_allclose(point_jacobian(points), auto, atol=1e-5)
+def test_sums_of_moments_are_the_normal_equations_of_moved_points():
+    rng = np.random.default_rng(1)
+    points, gap = (jnp.asarray(rng.normal(size=(3, 5)), jnp.float32) for _ in range(2))
+    weight = jnp.asarray(rng.uniform(size=5), jnp.float32)
+    J = jax.jacobian(lambda xi: jaxlie.SE3.exp(xi) @ points.T)(jnp.zeros(6))
+    matrix, vector = sliding(moments(jnp.concatenate([points, gap, jnp.ones((1, 5))]), weight))
+    np.testing.assert_allclose(matrix, jnp.einsum("n,nik,nil->kl", weight, J, J), atol=1e-5)
+    np.testing.assert_allclose(vector, jnp.einsum("n,nik,in->k", weight, J, gap), atol=1e-5)
+
+
+@pytest.mark.parametrize("degrees", [0.0, 1e-4, 179.9, 180.0])
+def test_points_are_moved_as_jaxlie_moves_them(degrees):
+    rng = np.random.default_rng(2)
+    axis = rng.normal(size=3)
+    turn = jaxlie.SO3.exp(jnp.asarray(np.deg2rad(degrees) * axis / np.linalg.norm(axis), jnp.float32))
+    T = jaxlie.SE3.from_rotation_and_translation(turn, jnp.asarray(rng.normal(size=3), jnp.float32))
+    points = jnp.asarray(rng.normal(size=(9, 3)), jnp.float32)
+    np.testing.assert_allclose(transformed(T, points), T @ points, atol=1e-6)
 
 
 @pytest.mark.parametrize("upright", [False, True])
