@@ -11,12 +11,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jaxtyping import Bool, Float
-from scipy.ndimage import binary_dilation
+from jaxtyping import Float
 from scipy.spatial import KDTree
 from skimage.measure import marching_cubes
 
 from more2_jax.config import MeshingConfig
+from more2_jax.lattice import Lattice, Level, cube, doubled, near_surface
 from more2_jax.prior import Prior, sdf_one
 from more2_jax.seen_surface import SeenSurface, seen_surface, some_of
 from more2_jax.types import Embedding, Mesh
@@ -25,8 +25,13 @@ from more2_jax.types import Embedding, Mesh
 # caches (2048 take 0.6 times as long as 8192 at a time); accelerators want large products.
 CHUNK = {"cpu": 2048}
 CHUNK_OF_OTHERS = 32768
-SLOPES = 4096  # points at most where the field's slope is asked; it has little to say at the others either
-OBSERVED = 4096  # and where its level is
+SLOPES = 2048  # points at most where the field's slope is asked; it has little to say at the others either
+OBSERVED = 2048  # and where its level is
+
+Ask = Callable[[Float[np.ndarray, "p 3"]], Float[np.ndarray, " p"]]  # the field at queries,
+Draw = Callable[
+    [Float[np.ndarray, "p 3"], Float[np.ndarray, " p"]], Float[np.ndarray, " p"]
+]  # and values by it
 
 _values = jax.jit(sdf_one)
 _slopes = jax.jit(jax.grad(lambda *asked: sdf_one(*asked).sum(), argnums=2))
@@ -56,20 +61,16 @@ def extract_mesh(
     through = surface_through(prior, embedding, seen, config, lowest, seen_from)
     ask = partial(_field, prior, embedding, level)
     draw = partial(_drawn, through, lowest)
-    first = _grid(config.coarse, half)
-    shape = [config.coarse + 1] * 3
-    field = ask(first)
-    values, field = draw(first, field).reshape(shape), field.reshape(shape)
+    found = _first(ask, draw, cube(config.coarse, half))
     asked = config.field_resolution or config.resolution
-    while len(values) - 1 < config.resolution:
-        if through is not None and config.screening and len(values) - 1 == asked:
-            field, values = _sided(through, config, lowest, field, half)
+    while (cells := round(2 * half / found.lattice.step)) < config.resolution:
+        if through is not None and config.screening and cells == asked:
+            found = _sided(through, config, lowest, found, 2 * half / config.resolution)
         else:
-            finer = ask if 2 * (len(values) - 1) <= asked else None
-            field, values = _refine(finer, draw, field, values, half)
-    if not (values < 0).any():
+            found = _refine(ask if 2 * cells <= asked else None, draw, found)
+    if not (found.values < 0).any():
         return None
-    return _surface(values, embedding, 2 * half / (len(values) - 1), half)
+    return _surface(found, embedding)
 
 
 def _check(config: MeshingConfig) -> None:
@@ -94,7 +95,7 @@ def surface_through(
     points = canonical(embedding, some_of(seen))
     eyes = None if seen_from is None else canonical(embedding, some_of(seen_from))
     asked = some_of(points, SLOPES)
-    slope = _in_chunks(_slopes, prior, embedding, asked)[KDTree(asked).query(points, workers=-1)[1]]
+    slope = _in_chunks(_slopes, prior, embedding, asked)[KDTree(asked).query(points, workers=1)[1]]
     return seen_surface(points, slope, config.seen_reach, lowest, eyes)
 
 
@@ -107,11 +108,6 @@ def observed_level(prior: Prior, embedding: Embedding, points: Float[np.ndarray,
 def canonical(embedding: Embedding, points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
     """Points of the scan's frame in canonical units, relative to the object's centre."""
     return (points - np.asarray(embedding.center, np.float64) - embedding.origin) / float(embedding.scale)
-
-
-def _grid(cells: int, half: float) -> Float[np.ndarray, "p 3"]:
-    axis = np.linspace(-half, half, cells + 1)
-    return np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
 
 
 def _field(
@@ -148,83 +144,58 @@ def _in_chunks(
     return np.concatenate(jax.device_get(parts))[: len(points)]
 
 
-def _refine(
-    ask: Callable[[Float[np.ndarray, "p 3"]], Float[np.ndarray, " p"]] | None,
-    draw: Callable[[Float[np.ndarray, "p 3"], Float[np.ndarray, " p"]], Float[np.ndarray, " p"]],
-    field: Float[np.ndarray, "n n n"],
-    values: Float[np.ndarray, "n n n"],
-    half: float,
-) -> tuple[Float[np.ndarray, "m m m"], Float[np.ndarray, "m m m"]]:
+def _first(ask: Ask, draw: Draw, lattice: Lattice) -> Level:
+    """The field and the values at all corners."""
+    queries = lattice.corners()
+    field = ask(queries)
+    values = draw(queries, field)
+    return Level(lattice, field.reshape(lattice.shape), values.reshape(lattice.shape))
+
+
+def _refine(ask: Ask | None, draw: Draw, level: Level) -> Level:
     """Field and values on the grid with half the step: new near the surface, interpolated elsewhere.
 
     Without `ask` the field is interpolated there too, and only what was seen draws it anew.
     """
-    cells = 2 * (len(values) - 1)
-    near = near_surface(values, 2 * half / (len(values) - 1))
-    field, values = doubled(field), doubled(values)
-    fine = np.zeros([cells + 1] * 3, bool)
+    near = near_surface(level.values, level.lattice.step)
+    finer = level.finer()
+    fine = np.zeros(finer.lattice.shape, bool)
     corners = 2 * np.argwhere(near)
     for step in itertools.product(range(3), repeat=3):
         fine[tuple((corners + step).T)] = True
     fine[::2, ::2, ::2] = False  # known from the coarse grid
-    queries = np.argwhere(fine) * (2 * half / cells) - half
+    queries = finer.lattice.at(np.argwhere(fine))
     if ask is not None:
-        field[fine] = ask(queries)
-    values[fine] = draw(queries, field[fine])
-    return field, values
+        finer.field[fine] = ask(queries)
+    finer.values[fine] = draw(queries, finer.field[fine])
+    return finer
 
 
-def _sided(
-    through: SeenSurface,
-    config: MeshingConfig,
-    lowest: float,
-    field: Float[np.ndarray, "n n n"],
-    half: float,
-) -> tuple[Float[np.ndarray, "m m m"], Float[np.ndarray, "m m m"]]:
+def _sided(through: SeenSurface, config: MeshingConfig, lowest: float, level: Level, finest: float) -> Level:
     """Field and values on a finer grid: inside and outside as what was seen has them, near it.
 
-    With half the step, or the last grid's if what was seen is exact enough for it.
+    With half the step, or the step `finest` if what was seen is exact enough for it; of the box alone that holds
+    what is inside and what was seen.
     """
-    exact = through.resolves(2 * half / config.resolution)
-    cells = config.resolution if exact else 2 * (len(field) - 1)
-    while len(field) - 1 < cells:
-        field = doubled(field)
-    below = lowest - np.linspace(-half, half, cells + 1)
-    field = through.screened(np.maximum(field, below), half, config.screening)
-    near, values = through.near(half, cells), field.copy()
-    values[near] = through.corrected(np.argwhere(near) * (2 * half / cells) - half, field[near])
-    return field, np.maximum(values, below)
+    seen = level.lattice.near(through.points, 0.0)
+    level = level.around(seen | (level.field < 0), config.screening)
+    step = finest if through.resolves(finest) else level.lattice.step / 2
+    lattice, field = level.lattice, level.field
+    while lattice.step > 1.5 * step:
+        lattice, field = lattice.finer(), doubled(field)
+    below = lowest - lattice.low[2] - lattice.step * np.arange(lattice.shape[2])
+    field = through.screened(np.maximum(field, below), lattice, config.screening)
+    near, values = lattice.near(through.points, through.farthest), field.copy()
+    values[near] = through.corrected(lattice.at(np.argwhere(near)), field[near])
+    return Level(lattice, field, np.maximum(values, below))
 
 
-def doubled(x: Float[np.ndarray, "n n n"]) -> Float[np.ndarray, "m m m"]:
-    """Linear interpolation to half the step: `scipy.ndimage.zoom`, which takes eight times as long."""
-    for axis in (2, 1, 0):
-        shape = list(x.shape)
-        shape[axis] = 2 * shape[axis] - 1
-        finer = np.empty(shape, x.dtype)
-        old, new = np.moveaxis(x, axis, 0), np.moveaxis(finer, axis, 0)  # views
-        new[::2] = old
-        new[1::2] = (old[:-1] + old[1:]) / 2
-        x = finer
-    return x
-
-
-def near_surface(values: Float[np.ndarray, "n n n"], cell: float) -> Bool[np.ndarray, "c c c"]:
-    """Cells whose corners differ in sign, or are nearer to the surface than the cell's diagonal: a thin leg may
-    pass between corners. One ring of cells more, since the field is only nearly a distance."""
-    n = len(values) - 1
-    offsets = itertools.product((0, 1), repeat=3)
-    corners = np.stack([values[i : i + n, j : j + n, k : k + n] for i, j, k in offsets])
-    straddles = (corners.min(axis=0) < 0) & (corners.max(axis=0) >= 0)
-    close = np.abs(corners).min(axis=0) < 0.5 * np.sqrt(3) * cell
-    return binary_dilation(straddles) | close
-
-
-def _surface(values: Float[np.ndarray, "m m m"], embedding: Embedding, step: float, half: float) -> Mesh:
+def _surface(level: Level, embedding: Embedding) -> Mesh:
     # A ring of outside around the box closes surfaces that reach its border.
-    padded = np.pad(values, 1, constant_values=max(float(values.max()), step))
+    lattice, values = level.lattice, level.values
+    padded = np.pad(values, 1, constant_values=max(float(values.max()), lattice.step))
     vertices, faces, _, _ = marching_cubes(padded, 0.0, gradient_direction="descent")
-    offsets = (vertices - 1) * step - half
+    offsets = lattice.at(vertices - 1)
     origin = np.asarray(embedding.origin, np.float64)
     placed = offsets * float(embedding.scale) + np.asarray(embedding.center, np.float64) + origin
     return Mesh(vertices=placed.astype(np.float64), faces=faces.astype(np.int64))

@@ -9,17 +9,18 @@ off the field alone goes on: what nobody saw is still completed.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
-from jaxtyping import Bool, Float
-from scipy.ndimage import maximum_filter
+from jaxtyping import Float, Int
 from scipy.spatial import KDTree
 
+from more2_jax.lattice import Grid, Lattice
 from more2_jax.orientation import outward_signs
-from more2_jax.screened_poisson import Grid, areas, screened
+from more2_jax.screened_poisson import areas, screened
 
 NEIGHBOURS = 12  # points of a plane
-ASKED = 8  # planes a query hears
+ASKED = 8  # planes a query hears, of the point nearest to it and of that point's neighbours
 MOST = 16_384  # points that are kept
 GAP = 3.0  # median distances between neighbours
 LEAST_GAP = 1e-3  # canonical units; where points are doubled
@@ -38,9 +39,16 @@ class SeenSurface:
     tree: KDTree  # of the points the planes belong to
     center: Points  # of each plane: its points' mean, which has less of their noise
     normal: Points  # unit length, outward
+    area: Float[np.ndarray, " _"]  # the share of the surface that each stands for
+    neighbours: Int[np.ndarray, "_ k"]  # of every point, nearest first
     reach: float  # off a plane, at this distance, its say has fallen to 1/e
     gap: float  # and along it, at this distance from the nearest point: it also holds between neighbours
     roughness: float  # how far off the planes their points lie, typically
+
+    @property
+    def points(self) -> Points:
+        """What was seen."""
+        return np.asarray(self.tree.data)
 
     @property
     def farthest(self) -> float:
@@ -54,37 +62,39 @@ class SeenSurface:
     def corrected(self, queries: Points, field: Float[np.ndarray, " _"]) -> Float[np.ndarray, " _"]:
         """Field values at queries, drawn towards the distance from the planes; signed, canonical units."""
         result = np.array(field, np.float64)
-        # The nearest alone first: most of a grid is out of reach, and stays as it is.
-        near = np.flatnonzero(
-            self.tree.query(queries, distance_upper_bound=self.farthest, workers=-1)[0] < np.inf
-        )
+        # Most of a grid is out of reach, and stays as it is.
+        distance, nearest = self.tree.query(queries, distance_upper_bound=self.farthest)
+        near = np.flatnonzero(distance < np.inf)
         if not len(near):
             return result
-        distance, index = self.tree.query(queries[near], k=ASKED, workers=-1)
-        offset = np.einsum("qki,qki->qk", queries[near, None] - self.center[index], self.normal[index])
-        closeness = np.exp(-0.5 * (distance**2 - distance[:, :1] ** 2) / self.gap**2)
-        agree = np.einsum("qki,qi->qk", self.normal[index], self.normal[index[:, 0]])
-        closeness *= np.maximum(agree, 0.0) ** ONE_FACE
+        way = queries[near] - self.points[nearest[near]]
+        normal, toward, height, agree = np.split(self.planes[nearest[near]], (3, 6, 7), axis=2)
+        offset = np.einsum("qi,qki->qk", way, normal) + height[..., 0]
+        squared = ((way[:, None] - toward) ** 2).sum(axis=2)
+        closeness = np.exp(-0.5 * (squared - squared[:, :1]) / self.gap**2) * agree[..., 0]
         plane = (closeness * offset).sum(axis=1) / closeness.sum(axis=1)
         # Flat at first: a field whose surface is a centimetre off must not draw this one towards it.
-        along = np.maximum(distance[:, 0] ** 2 - plane**2, 0.0)
+        along = np.maximum(squared[:, 0] - plane**2, 0.0)
         say = np.exp(-((plane / self.reach) ** 4) - (along / self.gap**2) ** 2)
         result[near] += say * (plane - result[near])
         return result
 
-    def near(self, half: float, cells: int) -> Bool[np.ndarray, "n n n"]:
-        """The corners of a cube's grid that may be near enough to a seen point to be drawn."""
-        step = 2 * half / cells
-        corner = np.rint((np.asarray(self.tree.data) + half) / step).astype(int)
-        held = corner[((corner >= 0) & (corner <= cells)).all(axis=1)]
-        seen = np.zeros([cells + 1] * 3, bool)
-        seen[tuple(held.T)] = True
-        return maximum_filter(seen, size=2 * int(np.ceil(self.farthest / step + 0.5)) + 1)
+    @cached_property
+    def planes(self) -> Float[np.ndarray, "n k 8"]:
+        """Of every point, the planes that a query nearest to it hears: its own, and those of its neighbours.
 
-    def screened(self, field: Grid, half: float, length: float) -> Grid:
-        """The field on a cube's grid, its sides near what was seen put right; `length`: how far that reaches."""
-        area = areas(self.tree, self.normal, NEIGHBOURS)
-        return screened(field, half, np.asarray(self.tree.data), self.normal, area, length)
+        Normal, way to the neighbour, height of the point over the neighbour's plane, how far the two face alike.
+        """
+        near = self.neighbours[:, :ASKED]
+        near[:, 0] = np.arange(len(near))  # where points are doubled, the first may be another
+        normal, toward = self.normal[near], self.points[near] - self.points[:, None]
+        height = np.einsum("nki,nki->nk", normal, self.points[:, None] - self.center[near])
+        agree = np.maximum(np.einsum("nki,ni->nk", normal, self.normal), 0.0) ** ONE_FACE
+        return np.concatenate([normal, toward, np.stack([height, agree], axis=2)], axis=2)
+
+    def screened(self, field: Grid, lattice: Lattice, length: float) -> Grid:
+        """The field on a lattice, its sides near what was seen put right; `length`: how far that reaches."""
+        return screened(field, lattice, self.points, self.normal, self.area, length)
 
 
 def some_of(points: Float[np.ndarray, "n *_"], most: int = MOST) -> Float[np.ndarray, "m *_"]:
@@ -108,7 +118,7 @@ def seen_surface(
     if len(points) < FEWEST:
         return None
     tree = KDTree(points)
-    apart, neighbours = tree.query(points, k=NEIGHBOURS, workers=-1)
+    apart, neighbours = tree.query(points, k=NEIGHBOURS, workers=1)
     center = points[neighbours].mean(axis=1)
     offset = points[neighbours] - center[:, None]
     spread, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", offset, offset) / NEIGHBOURS)
@@ -117,4 +127,7 @@ def seen_surface(
     rise = np.einsum("ni,ni->n", normal, around) / np.maximum(np.linalg.norm(around, axis=1), 1e-9)
     gap = GAP * max(float(np.median(apart[:, 1])), LEAST_GAP)
     signs = outward_signs(tree, normal, rise, gap, lowest, seen_from)
-    return SeenSurface(tree, center, signs[:, None] * normal, reach, gap, roughness)
+    normal = signs[:, None] * normal
+    return SeenSurface(
+        tree, center, normal, areas(points, normal, apart, neighbours), neighbours, reach, gap, roughness
+    )

@@ -6,13 +6,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import trimesh
-from scipy.ndimage import zoom
 from scipy.spatial import cKDTree
 from shapes import box_distance
 
 from more2_jax import meshing
 from more2_jax.config import MeshingConfig
-from more2_jax.meshing import doubled, extract_mesh, near_surface, observed_level
+from more2_jax.lattice import cube
+from more2_jax.meshing import extract_mesh, observed_level
 from more2_jax.types import Embedding
 
 SCALE = 2.0  # metres per canonical unit
@@ -155,14 +155,6 @@ def test_a_resolution_not_reached_by_doubling_is_refused(tiny_prior, coarse, res
         extract_mesh(tiny_prior, PIECE, config)
 
 
-def test_cells_that_the_surface_may_pass_are_looked_into():
-    axis = np.linspace(-1, 1, 9)
-    grid = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1)
-    near = near_surface(np.linalg.norm(grid - [0.1, 0.1, 0.1], axis=-1) - 0.05, 0.25)  # between all corners
-    assert near[4, 4, 4]
-    assert not near[0].any() and near.sum() < 30
-
-
 def test_the_decoder_itself_gives_a_closed_mesh_or_none(tiny_prior):
     rng = np.random.default_rng(0)
     code = dataclasses.replace(
@@ -171,7 +163,7 @@ def test_the_decoder_itself_gives_a_closed_mesh_or_none(tiny_prior):
         eqv=rng.normal(size=(3, 16)).astype(np.float32),
     )
     config = MeshingConfig(coarse=8, resolution=16)
-    values = meshing._field(tiny_prior, code, 0.0, meshing._grid(8, config.half_width))
+    values = meshing._field(tiny_prior, code, 0.0, cube(8, config.half_width).corners())
     mesh = extract_mesh(tiny_prior, code, config, level=float(np.median(values)))
     assert mesh is not None and solid(mesh).is_watertight
     assert extract_mesh(tiny_prior, code, config, level=float(values.min()) - 10.0) is None
@@ -207,8 +199,3 @@ def test_a_field_asked_less_finely_is_interpolated(field_is, tiny_prior):
     radius = np.linalg.norm(canonical(some), axis=1)
     assert 1e-4 < np.abs(radius - 0.4).max() < most
     assert solid(some).is_watertight
-
-
-def test_half_the_step_is_linear_interpolation():
-    x = np.random.default_rng(0).normal(size=(5, 5, 5))
-    np.testing.assert_allclose(doubled(x), zoom(x, 9 / 5, order=1, grid_mode=False), atol=1e-12)

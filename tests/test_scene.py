@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+import time
 
 import numpy as np
 import pytest
 from factories import scene_object, turn_z
 
+import more2_jax.scene
 from more2_jax import registration
 from more2_jax.config import JointConfig, MeshingConfig, preset
 from more2_jax.objects import apply_pose, moved_probability, points_of
@@ -155,6 +157,25 @@ def test_reconstruction_gives_closed_frames_and_leaves_finished_objects_alone(ti
     )
     again = reconstruct(tiny_prior, marked, CONFIG)
     assert all(a is b for a, b in zip(again.objects, marked.objects, strict=True))
+
+
+def test_meshes_come_in_order_whichever_is_ready_first_and_errors_come_through(
+    monkeypatch, tiny_prior, scene
+):
+    waits = {o.id: 0.2 / (k + 1) for k, o in enumerate(scene.objects)}
+
+    def slow(prior, o, scans, config):
+        time.sleep(waits[o.id])
+        return Mesh(vertices=np.full((1, 3), waits[o.id]), faces=np.zeros((0, 3), int))
+
+    monkeypatch.setattr(more2_jax.scene, "mesh_of", slow)
+    config = dataclasses.replace(CONFIG, joint=JointConfig(steps=0))
+    bare = dataclasses.replace(scene, objects=tuple(dataclasses.replace(o, mesh=None) for o in scene.objects))
+    done = reconstruct(tiny_prior, bare, config)
+    assert [o.mesh.vertices[0, 0] for o in done.objects] == [waits[o.id] for o in scene.objects]
+    monkeypatch.setattr(more2_jax.scene, "mesh_of", lambda prior, o, scans, config: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        reconstruct(tiny_prior, bare, config)
 
 
 def test_without_joint_steps_codes_and_poses_stay_and_with_them_they_do_not(tiny_prior, scene):

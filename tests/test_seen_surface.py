@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from more2_jax import meshing
 from more2_jax.config import MeshingConfig
+from more2_jax.lattice import cube
 from more2_jax.meshing import extract_mesh
 from more2_jax.seen_surface import FEWEST, MOST, seen_surface, some_of
 from more2_jax.types import Embedding
@@ -163,9 +164,8 @@ def test_every_corner_that_is_drawn_is_near():
     surface = seen_surface(
         sphere(2000, 0.3) + [0.25, 0, 0], sphere(2000, 0.3), REACH
     )  # partly beyond the grid
-    half, cells = 0.45, 36
-    near, axis = surface.near(half, cells), np.linspace(-half, half, cells + 1)
-    corners = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
+    lattice = cube(36, 0.45)
+    near, corners = lattice.near(surface.points, surface.farthest), lattice.corners()
     drawn = surface.corrected(corners, np.full(len(corners), 5.0)) != 5.0
     assert drawn.any() and near.ravel()[drawn].all() and near.mean() < 0.5
 
@@ -176,7 +176,7 @@ def test_a_grid_is_as_fine_as_the_points_are_exact(ball_of_036, tiny_prior, nois
 
     def noted(*asked):
         found = sided(*asked)
-        grids.append(len(found[1]) - 1)
+        grids.append(round(2 * CONFIG.half_width / found.lattice.step))
         return found
 
     monkeypatch.setattr(meshing, "_sided", noted)
