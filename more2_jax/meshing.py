@@ -95,7 +95,7 @@ def surface_through(
     points = canonical(embedding, some_of(seen))
     eyes = None if seen_from is None else canonical(embedding, some_of(seen_from))
     asked = some_of(points, SLOPES)
-    slope = _in_chunks(_slopes, prior, embedding, asked)[KDTree(asked).query(points, workers=1)[1]]
+    slope = _in_chunks(_slopes, prior, embedding, asked)[KDTree(asked).query(points)[1]]
     return seen_surface(points, slope, config.seen_reach, lowest, eyes)
 
 

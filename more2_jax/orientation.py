@@ -86,7 +86,7 @@ def first_met(
     ways = gap * STEP ** np.arange(STEPS)
     for way in ways[ways < FARTHEST][::-1]:
         there = points + way * direction
-        met = tree.query(there, distance_upper_bound=width * way, workers=1)[0] < np.inf
+        met = tree.query(there, distance_upper_bound=width * way)[0] < np.inf
         found[met | (there[:, 2] < lowest)] = way
     return found
 
@@ -100,7 +100,7 @@ def graph(
     """
     points = np.asarray(tree.data)
     count = min(NEIGHBOURS + 1, len(points))
-    distance, near = tree.query(points, k=count, workers=1)
+    distance, near = tree.query(points, k=count)
     i = np.repeat(np.arange(len(points)), count - 1)
     j, d = np.asarray(near)[:, 1:].ravel(), np.asarray(distance)[:, 1:].ravel()
     along = (points[j] - points[i]) / np.maximum(d, 1e-12)[:, None]

@@ -57,13 +57,13 @@ def screened(
     divergence = sum(w * transform(v, size) for w, v in zip(waves, flux, strict=True))
     change = squared * smooth(waves, step) * transform(prior, size)
     change += np.complex64(1j) * smooth(waves, width) * divergence
-    change = np.asarray(irfftn(change / (squared + np.float32(length**-2)), s=size, workers=1))
+    change = np.asarray(irfftn(change / (squared + np.float32(length**-2)), s=size))
     return (0.5 - prior + change[tuple(map(slice, shape))]) * 2 * SOFT * step
 
 
 def transform(x: Grid, size: list[int]) -> np.ndarray:
     """Fourier transform of a grid with empty space after it, single precision."""
-    return np.asarray(rfftn(x.astype(np.float32), s=size, workers=1))
+    return np.asarray(rfftn(x.astype(np.float32), s=size))
 
 
 def smooth(waves: Sequence[np.ndarray], width: float) -> np.ndarray:

@@ -118,7 +118,7 @@ def seen_surface(
     if len(points) < FEWEST:
         return None
     tree = KDTree(points)
-    apart, neighbours = tree.query(points, k=NEIGHBOURS, workers=1)
+    apart, neighbours = map(np.asarray, tree.query(points, k=NEIGHBOURS))
     center = points[neighbours].mean(axis=1)
     offset = points[neighbours] - center[:, None]
     spread, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", offset, offset) / NEIGHBOURS)
