@@ -114,7 +114,7 @@ def matching_study(scenes: Sequence[KnownScene], prior: Prior, o: Settings) -> l
             config = SceneConfig(matching=MatchingConfig(score=score))  # pyright: ignore[reportArgumentType]
             for b in range(1, len(scene.scans)):
                 one, other = scene.scans[0].instances, scene.scans[b].instances
-                matched = match_own(one, by_scan[0], other, by_scan[b], config)
+                matched = match_own(prior, one, by_scan[0], other, by_scan[b], config)
                 record = match_record(scene, b, f"matching by {name}", matched, 0.0)
                 # The other studies' `recall` is that of surfaces.
                 found.append((scene.name, {k: v for k, v in record.items() if not k.startswith("recall.")}))

@@ -111,7 +111,7 @@ def work(
         parts = np.split(np.arange(used, used + sum(counts)), np.cumsum(counts)[:-1])
         used += sum(counts)
         found.append(
-            _scene_records(scene, [[codes[k] for k in p] for p in parts], encoding_s, settings, peers)
+            _scene_records(scene, [[codes[k] for k in p] for p in parts], encoding_s, prior, settings, peers)
         )
     return found
 
@@ -120,6 +120,7 @@ def _scene_records(
     scene: KnownScene,
     codes: Sequence[Sequence[Embedding]],
     encoding_s: float,
+    prior: Prior,
     settings: Mapping[str, SceneConfig],
     peers: Mapping[str, Matcher],
 ) -> list[Record]:
@@ -130,7 +131,7 @@ def _scene_records(
             continue
         for name, config in settings.items():
             began = time.perf_counter()
-            matched = match_own(one, codes[0], other, codes[b], config)
+            matched = match_own(prior, one, codes[0], other, codes[b], config)
             seconds = time.perf_counter() - began + encoding_s * (len(one) + len(other))
             records.append(record(scene, b, name, matched, seconds))
         for name, matcher in peers.items():
@@ -141,6 +142,7 @@ def _scene_records(
 
 
 def match_own(
+    prior: Prior,
     one: Sequence[Instance],
     one_codes: Sequence[Embedding],
     other: Sequence[Instance],
@@ -151,7 +153,7 @@ def match_own(
     if not one or not other:
         return {}
     objects = [new_object(k, 0, i, e) for k, (i, e) in enumerate(zip(one, one_codes, strict=True))]
-    found = match_scan(objects, other, other_codes, config).found
+    found = match_scan(prior, objects, other, other_codes, config).found
     return {one[f.object].id: other[f.instance].id for f in found}
 
 

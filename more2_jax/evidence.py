@@ -1,7 +1,8 @@
 """Who is who by geometry: every candidate pair of objects aligned from many starts, and how well it then fits.
 
 Beyond the paper (preset `robust`): the embedding proposes, surfaces decide. A pair costs some milliseconds, since
-clouds are prepared once and compared by tables of nearest points.
+clouds are prepared once and compared by tables of nearest points. In any orientation more poses fit by chance, and no
+heights tell pairs apart: there the prior is asked too, whether each cloud lies on what it completes the other to.
 """
 
 from __future__ import annotations
@@ -20,8 +21,9 @@ from jaxtyping import Float, Int
 from more2_jax.alignment import Surface, scale_surface, whole_surface
 from more2_jax.config import RegistrationConfig
 from more2_jax.geometry import cloud_radius
+from more2_jax.prior import Prior
 from more2_jax.starts import Pair, candidate_poses
-from more2_jax.surface_registration import LIFTED, coarse_of, misfits_both_ways, search
+from more2_jax.surface_registration import LIFTED, coarse_of, doubts, misfits_both_ways, off_fields, search
 from more2_jax.types import Embedding, PointCloud, pytree, scale_embedding
 
 HYPOTHESES = 4  # poses of a pair that are remembered: the best, and others turned otherwise
@@ -38,11 +40,16 @@ class Evidence:
     of_target: Float[Array, "*pairs"]  # and of the target's
     lift: Float[Array, "*pairs"]  # change of height, metres
     radius: Float[Array, "*pairs"]  # of the target, metres
+    off_source: Float[
+        Array, "*pairs"
+    ]  # how far the source's points lie off the target's completed surface: 0 to 1
+    off_target: Float[Array, "*pairs"]  # and the target's off the source's; both 0 where that is not asked
     poses: jaxlie.SE3  # (*pairs, `HYPOTHESES`): source's local frame to target's, best first, metres
 
 
 @partial(jax.jit, static_argnames=("config", "upright"))
 def pair_evidence(
+    prior: Prior,
     source: PointCloud,
     target: PointCloud,
     source_code: Embedding,
@@ -70,12 +77,13 @@ def pair_evidence(
     def one(index: Int[Array, "2"]) -> Evidence:
         s, s_code = jax.tree.map(lambda x: x[index[0]], (sources, source_code))
         t, t_code, r = jax.tree.map(lambda x: x[index[1]], (targets, target_code, radius))
-        return fit(s, t, s_code, t_code, offset[index[0], index[1]], r, config, upright)
+        return fit(prior, s, t, s_code, t_code, offset[index[0], index[1]], r, config, upright)
 
     return jax.lax.map(one, pairs, batch_size=AT_ONCE)
 
 
 def fit(
+    prior: Prior,
     source: Surface,
     target: Surface,
     source_code: Embedding,
@@ -92,12 +100,28 @@ def fit(
     pair = Pair(source=s.sampled, target=t.sampled, source_code=a, target_code=b, offset=offset / radius)
     starts = candidate_poses(pair, config, upright)
     config = dataclasses.replace(config, keep_starts=HYPOTHESES)
-    poses, _ = search(starts, s, t, pair, config, upright)
+    poses, costs = search(starts, s, t, pair, config, upright)
+    off = jnp.zeros((HYPOTHESES, 2))
+    if asks_prior(config, upright):
+        off = off_fields(prior, poses, pair, (s, t))
+        order = jnp.argsort(costs + doubts(costs, off.mean(axis=1), config.field_weight))
+        poses, off = jax.tree.map(lambda x: x[order], (poses, off))
     T = jax.tree.map(lambda x: x[0], poses)
     there, back = misfits_both_ways(T, s, t, (config.truncation,))
-    lift = jnp.abs(T.translation()[2] - pair.offset[2]) * radius
-    in_metres = jaxlie.SE3.from_rotation_and_translation(poses.rotation(), poses.translation() * radius)
-    return Evidence(of_source=there, of_target=back, lift=lift, radius=radius, poses=in_metres)
+    return Evidence(
+        of_source=there,
+        of_target=back,
+        lift=jnp.abs(T.translation()[2] - pair.offset[2]) * radius,
+        radius=radius,
+        off_source=off[0, 0],
+        off_target=off[0, 1],
+        poses=jaxlie.SE3.from_rotation_and_translation(poses.rotation(), poses.translation() * radius),
+    )
+
+
+def asks_prior(config: RegistrationConfig, upright: bool) -> bool:
+    """Whether completed surfaces are evidence of who is who."""
+    return not upright and config.field_weight > 0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -121,20 +145,36 @@ class Calibration:
     likeness: float
     lift: float = 0.0  # of a change of height, in shares of `LIFTED` of the radius, at most 1
     top: float = 0.0  # of `top_m`, in shares of the radius, at most `HIGHEST`
+    off_less: float = 0.0  # of the smaller distance off the other's completed surface,
+    off_more: float = 0.0  # and of the larger
 
 
 HIGHEST = 0.2
 # Logistic regression on pairs of validation rooms; how, and how well it holds, is in docs/relocalisation.md.
 UPRIGHT = Calibration(intercept=3.7, nearer=-6.9, farther=-1.0, size=-2.7, likeness=2.6, lift=-2.5, top=-21.0)
-FREE = Calibration(intercept=1.2, nearer=-9.9, farther=-3.3, size=-4.2, likeness=5.7)
+FREE = Calibration(
+    intercept=2.6, nearer=-6.9, farther=0.0, size=-4.0, likeness=7.25, off_less=-11.1, off_more=-6.5
+)
+UNASKED = Calibration(
+    intercept=1.2, nearer=-9.9, farther=-3.3, size=-4.2, likeness=5.7
+)  # without the prior's say
 
 
-def log_odds(evidence: Evidence, compared: Compared, upright: bool) -> Float[np.ndarray, "*pairs"]:
-    """Of every pair to be one object; `upright`: of scans that share a frame, in which things stand on a floor."""
-    c, radius = UPRIGHT if upright else FREE, np.asarray(evidence.radius)
+def calibration(config: RegistrationConfig, upright: bool) -> Calibration:
+    """What the evidence of these settings was calibrated to; `upright`: things stand on the floor of one frame."""
+    if upright:
+        return UPRIGHT
+    return FREE if asks_prior(config, upright) else UNASKED
+
+
+def log_odds(evidence: Evidence, compared: Compared, c: Calibration) -> Float[np.ndarray, "*pairs"]:
+    """Of every pair to be one object."""
+    radius = np.asarray(evidence.radius)
     ways = np.stack([evidence.of_source, evidence.of_target])
     lift = np.minimum(np.asarray(evidence.lift) / (LIFTED * radius), 1.0)
     top = np.minimum(compared.top_m / radius, HIGHEST)
     fit = c.intercept + c.nearer * ways.min(axis=0) + c.farther * ways.max(axis=0)
     fit += c.size * compared.size + c.likeness * compared.likeness + c.lift * lift + c.top * top
+    off = np.stack([evidence.off_source, evidence.off_target])
+    fit += c.off_less * off.min(axis=0) + c.off_more * off.max(axis=0)
     return fit + compared.color

@@ -28,6 +28,7 @@ from more2_jax.consensus import (
     with_errors,
 )
 from more2_jax.metrics import apply_pose
+from more2_jax.prior import Prior
 from more2_jax.sight import moved_sight
 from more2_jax.types import Embedding, Frame, move_embedding
 from more2_jax.verification import Known, PairFits, assign, compared, fit_pairs, heights, proposal_of
@@ -81,11 +82,11 @@ def lift(height_m: float) -> Pose:
 
 
 def common_frame(
-    old: Sequence[Known], new: Sequence[Known], config: SceneConfig, rooms: Rooms
+    prior: Prior, old: Sequence[Known], new: Sequence[Known], config: SceneConfig, rooms: Rooms
 ) -> tuple[Frame, PairFits]:
     """The frame of a new scan, and how its instances (`new`, own frame) then fit the objects (`old`, scene's)."""
-    height, fits = common_height(old, new, config, rooms) if config.upright else (0.0, None)
-    fits = fits or fit_pairs(old, new, config)
+    height, fits = common_height(prior, old, new, config, rooms) if config.upright else (0.0, None)
+    fits = fits or fit_pairs(prior, old, new, config)
     lifted = lift(height)
     pairs = np.argwhere(fits.odds > 0)
     votes = Votes(
@@ -130,21 +131,21 @@ def settled_frame(
 
 
 def common_height(
-    old: Sequence[Known], new: Sequence[Known], config: SceneConfig, rooms: Rooms
+    prior: Prior, old: Sequence[Known], new: Sequence[Known], config: SceneConfig, rooms: Rooms
 ) -> tuple[float, PairFits]:
     """What to add to a scan's heights, metres, and how pairs then fit: the lift that explains the scans best.
 
     Nothing, unless most tops and bottoms of likely pairs agree on something else, and pairs fit clearly better.
     """
     votes, weights = height_votes(old, new, config)
-    none = fit_pairs(old, new, config)
+    none = fit_pairs(prior, old, new, config)
     candidates = {best_vote(votes, weights)} if doubtful(votes, weights) else set()
     floors = [floor_height(p) for p in (rooms.scene, rooms.scan)]
     if floors[0] is not None and floors[1] is not None:
         candidates.add(floors[0] - floors[1])
     best, height = none, 0.0
     for lifted_m in sorted(c for c in candidates if abs(c) > LEAST_M):
-        found, fits = settled(old, new, config, lifted_m)
+        found, fits = settled(prior, old, new, config, lifted_m)
         margin = CLEARLY if height == 0.0 else 0.0
         if explained(fits) > explained(best) + margin:
             best, height = fits, found
@@ -152,17 +153,17 @@ def common_height(
 
 
 def settled(
-    old: Sequence[Known], new: Sequence[Known], config: SceneConfig, height_m: float
+    prior: Prior, old: Sequence[Known], new: Sequence[Known], config: SceneConfig, height_m: float
 ) -> tuple[float, PairFits]:
     """A height corrected by the pairs that it makes fit, and how they fit then."""
-    fits = fit_pairs(old, [moved(k, lift(height_m)) for k in new], config)
+    fits = fit_pairs(prior, old, [moved(k, lift(height_m)) for k in new], config)
     pairs = assign(fits.odds, np.zeros(fits.odds.shape), 0.0)
     if len(pairs) < 2:
         return height_m, fits
     more = float(np.median(fits.T_old_new[pairs[:, 0], pairs[:, 1], 0, 2, 3]))
     if not LEAST_M < abs(more) < 0.1:
         return height_m, fits
-    again = fit_pairs(old, [moved(k, lift(height_m + more)) for k in new], config)
+    again = fit_pairs(prior, old, [moved(k, lift(height_m + more)) for k in new], config)
     return (height_m + more, again) if explained(again) > explained(fits) else (height_m, fits)
 
 

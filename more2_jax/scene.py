@@ -77,7 +77,7 @@ def add_scan(
         instances = instances_with_sight(instances, scan, remembered(scan.background))
         objects = objects_with_sight(objects, scene.scans)
     with stage("match", len(instances)):
-        identified = match_scan(objects, instances, embeddings, config, rooms_of(scene, scan))
+        identified = match_scan(prior, objects, instances, embeddings, config, rooms_of(scene, scan))
     found, chance = identified.found, {objects[k].id: p for k, p in identified.gone.items()}
     with stage("register", len(found), unit="pairs"):
         seen, frame = register_in_frame(prior, objects, instances, embeddings, identified, index, config)

@@ -69,14 +69,13 @@ def register_surfaces(
         poses = join(poses, stayed)  # also exactly as it is
     misfits = jax.vmap(lambda T: misfit(T, source, target, truncations))(poses)
     costs = misfits + lifted(poses, pair.offset, config, upright) + freed(poses, pair, source, target, config)
-    doubt = doubts(prior, poses, costs, pair, whole, config)
+    doubt = prior_doubts(prior, poses, costs, pair, whole, config)
     best = choose(costs, config.identity_start, doubt)
     T = polished(jax.tree.map(lambda x: x[best], poses), whole, misfits[best], config, upright)
     if config.identity_start:  # what stayed is exactly where it was
         T = jax.tree.map(lambda x, y: jnp.where(best == len(misfits) - 1, y[0], x), T, stayed)
     rms = two_way_rms(move(T, source.sampled), target.sampled, config.trim)
-    last = align_step(T, source, target, jnp.asarray(config.last_reach), upright)
-    still = jnp.linalg.norm((last @ T.inverse()).log()) < STILL
+    still = settled(T, source, target, config, upright)
     return Registration(
         T_target_source=T,
         loss=misfits[best],
@@ -87,6 +86,14 @@ def register_surfaces(
         competing=poses,
         competes=competing(poses, costs + doubt, best),
     )
+
+
+def settled(
+    T: jaxlie.SE3, source: Surface, target: Surface, config: RegistrationConfig, upright: bool
+) -> Bool[Array, ""]:
+    """Whether one more step hardly changes the pose."""
+    last = align_step(T, source, target, jnp.asarray(config.last_reach), upright)
+    return jnp.linalg.norm((last @ T.inverse()).log()) < STILL
 
 
 def coarse_of(s: Surface, config: RegistrationConfig) -> Surface:
@@ -138,7 +145,7 @@ def freed(
     return cost
 
 
-def doubts(
+def prior_doubts(
     prior: Prior,
     poses: jaxlie.SE3,
     costs: Float[Array, " k"],
@@ -146,21 +153,24 @@ def doubts(
     whole: Sequence[Surface],
     config: RegistrationConfig,
 ) -> Float[Array, " k"]:
-    """What the prior adds to the costs of poses: it tells those apart that fit about as well, and has no say beyond."""
+    """`doubts` of both ways' mean; none where the prior is not asked."""
     if not config.field_weight:
         return jnp.zeros_like(costs)
-    off = off_fields(prior, poses, pair, whole, config.sdf_points)
-    return config.field_weight * jnp.where(costs <= costs.min() + ABOUT_AS_WELL, off, 1.0)
+    few = [thinned(s, config.sdf_points) for s in whole]
+    return doubts(costs, off_fields(prior, poses, pair, few).mean(axis=1), config.field_weight)
+
+
+def doubts(costs: Float[Array, " k"], off: Float[Array, " k"], weight: float) -> Float[Array, " k"]:
+    """What the prior adds to the costs of poses: it tells those apart that fit about as well, and has no say beyond."""
+    return weight * jnp.where(costs <= costs.min() + ABOUT_AS_WELL, off, 1.0)
 
 
 def off_fields(
-    prior: Prior, poses: jaxlie.SE3, pair: Pair, whole: Sequence[Surface], count: int
-) -> Float[Array, " k"]:
-    """Of every pose, how far both clouds lie from the surface that the prior gives the other: 0 on it, 1 `OFF_FIELD`.
-
-    `count` points of each cloud are asked about. A pose that is not finite has 1.
-    """
-    source, target = (thinned(s, count).sampled for s in whole)
+    prior: Prior, poses: jaxlie.SE3, pair: Pair, surfaces: Sequence[Surface]
+) -> Float[Array, "k 2"]:
+    """Of every pose, how far the source's sample lies from the surface that the prior gives the target, and the
+    target's from that of the source: 0 on it, 1 `OFF_FIELD` away. A pose that is not finite has 1."""
+    source, target = (s.sampled for s in surfaces)
 
     def one_way(T: jaxlie.SE3, cloud: Sampled, code: Embedding) -> Float[Array, ""]:
         distance = jnp.abs(field_sdf(prior, object_field(prior, code), transformed(T, cloud.points)))
@@ -168,9 +178,9 @@ def off_fields(
         mean = share.sum() / jnp.maximum(cloud.mask.sum(), 1)
         return jnp.where(jnp.isfinite(mean), mean, 1.0)
 
-    def both_ways(T: jaxlie.SE3) -> Float[Array, ""]:
+    def both_ways(T: jaxlie.SE3) -> Float[Array, "2"]:
         there = one_way(T, source, pair.target_code)
-        return (there + one_way(T.inverse(), target, pair.source_code)) / 2
+        return jnp.stack([there, one_way(T.inverse(), target, pair.source_code)])
 
     return jax.vmap(both_ways)(poses)
 

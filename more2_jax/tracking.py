@@ -63,6 +63,7 @@ class Identified:
 
 
 def match_scan(
+    prior: Prior,
     objects: Sequence[SceneObject],
     instances: Sequence[Instance],
     embeddings: Sequence[Embedding],
@@ -71,7 +72,7 @@ def match_scan(
 ) -> Identified:
     """One assignment of all objects, present or absent just now, to the instances of a scan."""
     if config.matching.verify:
-        return verified(objects, instances, embeddings, config, rooms)
+        return verified(prior, objects, instances, embeddings, config, rooms)
     old, real_old = stack([o.embedding for o in objects])
     new, real_new = stack(embeddings)
     bonus = np.zeros((len(real_old), len(real_new)), np.float32)
@@ -84,6 +85,7 @@ def match_scan(
 
 
 def verified(
+    prior: Prior,
     objects: Sequence[SceneObject],
     instances: Sequence[Instance],
     embeddings: Sequence[Embedding],
@@ -96,7 +98,7 @@ def verified(
         Known(points=i.points, embedding=e, color=color_of(i.colors))
         for i, e in zip(instances, embeddings, strict=True)
     ]
-    frame, fits = common_frame(old, new, config, rooms)
+    frame, fits = common_frame(prior, old, new, config, rooms)
     odds = fits.odds
     centers = apply_pose(frame.T_scene_scan, np.stack([i.points.mean(axis=0) for i in instances]))
     pairs = assign(odds, distances(objects, centers), config.matching.motion_weight)

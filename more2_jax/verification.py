@@ -23,7 +23,8 @@ from more2_jax.batching import bucket
 from more2_jax.color import color_evidence
 from more2_jax.config import SceneConfig
 from more2_jax.encoding import at_zero, padded, stack, with_origin
-from more2_jax.evidence import HYPOTHESES, Compared, log_odds, pair_evidence
+from more2_jax.evidence import HYPOTHESES, Compared, calibration, log_odds, pair_evidence
+from more2_jax.prior import Prior
 from more2_jax.types import Color, Embedding, Sight
 
 Points = Float[np.ndarray, "_ 3"]
@@ -55,7 +56,7 @@ class PairFits:
     T_old_new: Float[np.ndarray, "n m h 4 4"]  # poses that fit, best first, float64; NaN where never tried
 
 
-def fit_pairs(old: Sequence[Known], new: Sequence[Known], config: SceneConfig) -> PairFits:
+def fit_pairs(prior: Prior, old: Sequence[Known], new: Sequence[Known], config: SceneConfig) -> PairFits:
     """Aligns the likeliest pairs; all of `old` and `new` in one frame, or in two that differ by any motion.
 
     Upright, the frames have one height (see `frames.common_height`).
@@ -75,6 +76,7 @@ def fit_pairs(old: Sequence[Known], new: Sequence[Known], config: SceneConfig) -
     pairs = np.zeros((count, 2), np.int32)
     pairs[: len(rows)] = rows[:, ::-1]
     found = pair_evidence(
+        prior,
         *flat,
         *codes,
         jnp.asarray(offset, jnp.float32),
@@ -89,7 +91,7 @@ def fit_pairs(old: Sequence[Known], new: Sequence[Known], config: SceneConfig) -
         evidence.poses, np.asarray(target.origin)[rows[:, 0]], np.asarray(source.origin)[rows[:, 1]]
     )
     of_candidates = Compared(**{k: v[candidates] for k, v in vars(known).items()})
-    result[candidates] = log_odds(evidence, of_candidates, config.upright)
+    result[candidates] = log_odds(evidence, of_candidates, calibration(config.registration, config.upright))
     return PairFits(odds=result, T_old_new=poses)
 
 

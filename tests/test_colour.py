@@ -59,7 +59,7 @@ def identified(prior, first: Scan, second: Scan):
     """Who is who in the second scan."""
     codes = [embed(prior, [i.points for i in s.instances]) for s in (first, second)]
     objects = [new_object(k, 0, i, e) for k, (i, e) in enumerate(zip(first.instances, codes[0], strict=True))]
-    return match_scan(objects, second.instances, codes[1], CONFIG)
+    return match_scan(prior, objects, second.instances, codes[1], CONFIG)
 
 
 def partners(result) -> list[tuple[int, int, bool]]:

@@ -112,8 +112,8 @@ def test_fixed_batches_give_what_single_calls_give(tiny_prior):
 
 def test_matching_of_nothing(tiny_prior):
     scan = known_scene().scans[0].instances
-    assert match_own([], [], scan, [], SceneConfig()) == {}
-    assert match_own(scan, [], [], [], SceneConfig()) == {}
+    assert match_own(tiny_prior, [], [], scan, [], SceneConfig()) == {}
+    assert match_own(tiny_prior, scan, [], [], [], SceneConfig()) == {}
 
 
 @pytest.mark.slow

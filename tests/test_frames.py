@@ -128,7 +128,7 @@ def test_floors_propose_a_height_where_the_objects_do_not_agree(tiny_prior):
     old, new = (
         [Known(points=c, embedding=e)] for c, e in zip(clouds, embed(tiny_prior, clouds), strict=True)
     )
-    height, fits = common_height(old, new, config, Rooms(scene=room(0.0, 0), scan=room(1.0, 1)))
+    height, fits = common_height(tiny_prior, old, new, config, Rooms(scene=room(0.0, 0), scan=room(1.0, 1)))
     assert height == pytest.approx(-1.0, abs=0.01)
     assert fits.odds[0, 0] > 0
 

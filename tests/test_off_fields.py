@@ -12,18 +12,17 @@ from compiling import quick_jit
 from scipy.spatial.transform import Rotation
 
 from more2_jax import surface_registration
-from more2_jax.alignment import whole_surface
+from more2_jax.alignment import thinned, whole_surface
 from more2_jax.batching import pad_clouds
 from more2_jax.config import preset
 from more2_jax.geometry import Sampled
 from more2_jax.prior import encode, load_prior, sdf_one
 from more2_jax.starts import Pair
-from more2_jax.surface_registration import ABOUT_AS_WELL, OFF_FIELD
+from more2_jax.surface_registration import ABOUT_AS_WELL, OFF_FIELD, doubts
 
 POINTS, COUNT = 512, 64
 CONFIG = preset("robust", upright=True).registration
-off_fields = quick_jit(surface_registration.off_fields, static_argnames="count")
-doubts = quick_jit(surface_registration.doubts, static_argnames="config")
+off_both_ways = quick_jit(surface_registration.off_fields)
 surface_of = quick_jit(whole_surface)
 
 
@@ -53,6 +52,11 @@ def poses_of(*matrices):
     return jax.tree.map(
         lambda *x: jnp.stack(x), *[jaxlie.SE3.from_matrix(jnp.asarray(T, jnp.float32)) for T in matrices]
     )
+
+
+def off_fields(prior, poses, pair, surfaces, count):
+    """The mean of both ways."""
+    return off_both_ways(prior, poses, pair, [thinned(s, count) for s in surfaces]).mean(axis=1)
 
 
 @pytest.fixture(scope="module")
@@ -97,17 +101,25 @@ def test_moving_the_target_moves_the_pose_alone(prior, example):
     np.testing.assert_allclose(there, here, atol=5e-3)
 
 
-def test_it_chooses_among_poses_that_fit_about_as_well_and_no_others(prior, example):
-    half = pieces.pose(Rotation.from_euler("z", 180, degrees=True), np.zeros(3))
-    poses = poses_of(half, np.eye(4), np.eye(4))
-    costs = jnp.array([0.2, 0.2 + 0.9 * ABOUT_AS_WELL, 0.2 + 1.1 * ABOUT_AS_WELL])
-    found = doubts(prior, poses, costs, *example, CONFIG) / CONFIG.field_weight
-    np.testing.assert_allclose(
-        found[:2], off_fields(prior, poses, *example, CONFIG.sdf_points)[:2], rtol=1e-6
+def test_each_way_is_that_of_the_other_cloud(prior, example):
+    pair, surfaces = example
+    T = pieces.pose(Rotation.from_euler("z", 20, degrees=True), np.array([0.05, 0.0, 0.02]))
+    swapped = dataclasses.replace(
+        pair,
+        source=pair.target,
+        target=pair.source,
+        source_code=pair.target_code,
+        target_code=pair.source_code,
     )
-    assert found[2] == 1
-    without = dataclasses.replace(CONFIG, field_weight=0.0)
-    assert not doubts(prior, poses, costs, *example, without).any()
+    there = off_both_ways(prior, poses_of(T), pair, surfaces)
+    back = off_both_ways(prior, poses_of(np.linalg.inv(T)), swapped, surfaces[::-1])
+    np.testing.assert_allclose(there[0], back[0, ::-1], atol=1e-5)
+    assert abs(there[0, 0] - there[0, 1]) > 1e-3
+
+
+def test_it_chooses_among_poses_that_fit_about_as_well_and_no_others():
+    costs = jnp.array([0.2, 0.2 + 0.9 * ABOUT_AS_WELL, 0.2 + 1.1 * ABOUT_AS_WELL])
+    np.testing.assert_allclose(doubts(costs, jnp.array([0.3, 0.1, 0.0]), 2.0), [0.6, 0.2, 2.0])
 
 
 def test_only_robust_asks_for_it():

@@ -1,11 +1,30 @@
 """Who is who by geometry: what is assigned, what is left over and how surely, and which copies are interchangeable."""
 
+import dataclasses
+
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.special import expit
 
+from more2_jax.alignment import coarsened, whole_surface
 from more2_jax.config import preset
-from more2_jax.encoding import embed
+from more2_jax.encoding import at_zero, embed, padded, stack, with_origin
+from more2_jax.evidence import (
+    FREE,
+    HIGHEST,
+    UNASKED,
+    UPRIGHT,
+    Calibration,
+    Compared,
+    Evidence,
+    calibration,
+    log_odds,
+    pair_evidence,
+)
+from more2_jax.starts import Pair
+from more2_jax.surface_registration import LIFTED, off_fields
 from more2_jax.verification import (
     NEVER,
     Known,
@@ -50,6 +69,55 @@ def test_a_copy_that_went_makes_the_other_interchangeable_and_far_motion_alone_r
     assert assign(np.array([[0.5]]), np.array([[100.0]]), 0.2).tolist() == [[0, 0]]
 
 
+def test_log_odds_are_linear_and_the_two_ways_have_no_order():
+    rng = np.random.default_rng(0)
+    values = {k: rng.uniform(size=3) for k in ("of_source", "of_target", "off_source", "off_target", "lift")}
+    evidence = Evidence(radius=np.full(3, 0.5), poses=None, **values)
+    known = Compared(**{k: rng.uniform(size=3) for k in ("size", "likeness", "top_m", "color")})
+    c = Calibration(
+        intercept=1.0,
+        nearer=2.0,
+        farther=3.0,
+        size=4.0,
+        likeness=5.0,
+        lift=6.0,
+        top=7.0,
+        off_less=8.0,
+        off_more=9.0,
+    )
+    by_hand = 1 + 4 * known.size + 5 * known.likeness + known.color
+    by_hand += 6 * np.minimum(values["lift"] / (LIFTED * 0.5), 1) + 7 * np.minimum(known.top_m / 0.5, HIGHEST)
+    for k, less, more in (("of", 2, 3), ("off", 8, 9)):
+        a, b = values[f"{k}_source"], values[f"{k}_target"]
+        by_hand += less * np.minimum(a, b) + more * np.maximum(a, b)
+    np.testing.assert_allclose(log_odds(evidence, known, c), by_hand)
+
+
+def test_the_prior_is_asked_in_any_orientation_alone_and_only_where_it_may_choose():
+    upright, free = (preset("robust", upright=u).registration for u in (True, False))
+    assert calibration(upright, True) is UPRIGHT and calibration(free, False) is FREE
+    assert calibration(dataclasses.replace(free, field_weight=0.0), False) is UNASKED
+    assert not (UPRIGHT.off_less or UPRIGHT.off_more or UNASKED.off_less or UNASKED.off_more)
+
+
+def test_in_any_orientation_the_evidence_is_that_of_the_best_pose(tiny_prior):
+    rng = np.random.default_rng(3)
+    clouds = [box(rng, np.array([1.0, 0.5, 0.6]), 200) + [k, 0, 0] for k in range(2)]
+    cloud = padded(clouds)
+    codes = at_zero(with_origin(stack(embed(tiny_prior, clouds))[0], np.asarray(cloud.origin)))
+    flat = dataclasses.replace(cloud, origin=jnp.zeros((len(cloud.points), 3)))
+    config = dataclasses.replace(preset("robust").registration, coarse_steps=4, coarse_dense=256, cells=8)
+    offset, pairs = jnp.zeros((len(cloud.points),) * 2 + (3,)), jnp.array([[0, 1]])
+    found = pair_evidence(tiny_prior, flat, flat, codes, codes, offset, pairs, config, False)
+    T = jax.tree.map(lambda x: x[0], found.poses)
+    surfaces = [coarsened(whole_surface(cloud.points[k], cloud.mask[k]), 128, 256, 8) for k in range(2)]
+    sampled = [s.sampled for s in surfaces]
+    a, b = (jax.tree.map(lambda x, k=k: jnp.asarray(x)[k], codes) for k in range(2))
+    pair = Pair(source=sampled[0], target=sampled[1], source_code=a, target_code=b, offset=jnp.zeros(3))
+    off = off_fields(tiny_prior, T, pair, surfaces)
+    np.testing.assert_allclose([found.off_source[0], found.off_target[0]], off[0], atol=1e-3)
+
+
 def test_what_is_left_over_is_gone_unless_another_left_over_may_be_it():
     odds = np.array([[2.0, -1.0, -2.0], [-3.0, -1.0, NEVER]])
     gone, new = unmatched(odds, np.array([[0, 0]]))
@@ -76,6 +144,6 @@ def test_geometry_tells_boxes_of_one_size_but_different_shape_apart(tiny_prior):
         [Known(points=p, embedding=e) for p, e in zip(clouds, embed(tiny_prior, clouds), strict=True)]
         for clouds in (first, second)
     ]
-    odds = fit_pairs(known[0], known[1], preset("robust", upright=True)).odds
+    odds = fit_pairs(tiny_prior, known[0], known[1], preset("robust", upright=True)).odds
     assert odds.shape == (2, 2)
     assert min(odds[0, 1], odds[1, 0]) > max(odds[0, 0], odds[1, 1]) + 1
