@@ -139,6 +139,10 @@ class MeshingConfig:
     )
     # On grids finer than `field_resolution`, so near (canonical units) to seen points their sides count, not its.
     screening: float = 0.0
+    # A seen point whose local outlier factor is larger is no surface: where one scan saw the object, and where several
+    # did, which confirm one another. 0: all points count.
+    outlier_factor: float = 0.0
+    outlier_factor_of_many: float = 0.0
     floor: bool = False  # of upright scans: nothing reaches below the floor, where the room is seen
     half_width: float = 0.65  # of the query box, canonical units; objects are turned in it, so more than 0.55
 
@@ -243,6 +247,8 @@ def preset(name: str, *, upright: bool = False) -> SceneConfig:
                 level="observed",
                 seen_reach=0.02,
                 screening=0.12,
+                outlier_factor=1.5,
+                outlier_factor_of_many=1.25,
                 floor=True,
             ),
             # No step: after alignment by surfaces it buys neither poses nor meshes (docs/design_notes.md).

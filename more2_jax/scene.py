@@ -25,8 +25,10 @@ from more2_jax.objects import (
     new_object,
     seen_again,
 )
+from more2_jax.outliers import inliers
 from more2_jax.prior import Prior
 from more2_jax.progress import Watcher, staged
+from more2_jax.seen_surface import some_of
 from more2_jax.sights import few_sensors, instances_with_sight, objects_with_sight, seen_from
 from more2_jax.tracking import match_scan, register_in_frame
 from more2_jax.types import Frame, Instance, LivingScene, Mesh, Scan, ScanRecord, SceneObject, Skipped
@@ -152,12 +154,23 @@ def mesh_of(prior: Prior, o: SceneObject, scans: Sequence[ScanRecord], config: S
 
     `level` "observed": seen points lie on the surface, so the field's median there is its bias, and is taken off.
     """
-    points = accumulated_points(o)
+    points, eyes = trusted(o, scans, config)
     level = observed_level(prior, o.embedding, points) if config.meshing.level == "observed" else 0.0
     floor = floor_under(o, scans[o.reference_scan].background, config)
     half = box_half_width(o, config)
-    eyes = seen_from(o, scans) if config.meshing.seen_reach else None
     return extract_mesh(prior, o.embedding, config.meshing, half, level, points, floor, eyes)
+
+
+def trusted(
+    o: SceneObject, scans: Sequence[ScanRecord], config: SceneConfig
+) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n s 3"] | None]:
+    """What was seen of an object without outliers, thinned, in its frame; and from where, if that is known and used."""
+    points = some_of(accumulated_points(o))
+    eyes = seen_from(o, scans) if config.meshing.seen_reach else None
+    many = len(accumulated(o)) > 1
+    most = config.meshing.outlier_factor_of_many if many else config.meshing.outlier_factor
+    kept = inliers(points, most)
+    return points[kept], None if eyes is None else some_of(eyes)[kept]
 
 
 def box_half_width(o: SceneObject, config: SceneConfig) -> float:

@@ -46,6 +46,7 @@ LAYERS = {
         "evidence",
         "registration",
         "orientation",
+        "outliers",
         "lattice",
         "screened_poisson",
         "seen_surface",
