@@ -214,6 +214,19 @@ class TrainingRun:
     training: TrainingConfig = field(default_factory=TrainingConfig)
 
 
+ROBUST_MESHING = MeshingConfig(
+    coarse=16,
+    resolution=128,
+    field_resolution=32,
+    level="observed",
+    seen_reach=0.02,
+    screening=0.12,
+    outlier_factor=1.5,
+    outlier_factor_of_many=1.25,
+    floor=True,
+)
+
+
 def preset(name: str, *, upright: bool = False) -> SceneConfig:
     """Returns the settings called `paper` or `robust`."""
     if name == "paper":
@@ -240,17 +253,7 @@ def preset(name: str, *, upright: bool = False) -> SceneConfig:
                 field_weight=2.0,
                 free_weight=1.0 if upright else 0.0,
             ),
-            meshing=MeshingConfig(
-                coarse=16,
-                resolution=128,
-                field_resolution=32,
-                level="observed",
-                seen_reach=0.02,
-                screening=0.12,
-                outlier_factor=1.5,
-                outlier_factor_of_many=1.25,
-                floor=True,
-            ),
+            meshing=ROBUST_MESHING,
             # No step: after alignment by surfaces it buys neither poses nor meshes (docs/design_notes.md).
             joint=JointConfig(points=128, start="accumulated", steps=0, eqv_learning_rate=1e-3),
         )
