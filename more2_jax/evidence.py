@@ -23,7 +23,15 @@ from more2_jax.config import RegistrationConfig
 from more2_jax.geometry import cloud_radius
 from more2_jax.prior import Prior
 from more2_jax.starts import Pair, candidate_poses
-from more2_jax.surface_registration import LIFTED, coarse_of, doubts, misfits_both_ways, off_fields, search
+from more2_jax.surface_registration import (
+    LIFTED,
+    coarse_of,
+    doubts,
+    misfits_both_ways,
+    off_field,
+    off_fields,
+    search,
+)
 from more2_jax.types import Embedding, PointCloud, pytree, scale_embedding
 
 HYPOTHESES = 4  # poses of a pair that are remembered: the best, and others turned otherwise
@@ -43,7 +51,10 @@ class Evidence:
     off_source: Float[
         Array, "*pairs"
     ]  # how far the source's points lie off the target's completed surface: 0 to 1
-    off_target: Float[Array, "*pairs"]  # and the target's off the source's; both 0 where that is not asked
+    off_target: Float[Array, "*pairs"]  # and the target's off the source's; all 0 where that is not asked
+    off_own: Float[
+        Array, "*pairs"
+    ]  # how far either lies off its own at most: what the prior does not even know
     poses: jaxlie.SE3  # (*pairs, `HYPOTHESES`): source's local frame to target's, best first, metres
 
 
@@ -72,14 +83,28 @@ def pair_evidence(
         return jax.lax.map(one, (cloud.points, cloud.mask))
 
     sources, targets = prepared(source), prepared(target)
+    own = [jnp.zeros(len(c.points)) for c in (source, target)]
+    if asks_prior(config, upright):
+        own = [off_own(prior, s, c) for s, c in ((sources, source_code), (targets, target_code))]
     radius = jax.vmap(cloud_radius)(target.points, target.mask)
 
     def one(index: Int[Array, "2"]) -> Evidence:
         s, s_code = jax.tree.map(lambda x: x[index[0]], (sources, source_code))
         t, t_code, r = jax.tree.map(lambda x: x[index[1]], (targets, target_code, radius))
-        return fit(prior, s, t, s_code, t_code, offset[index[0], index[1]], r, config, upright)
+        found = fit(prior, s, t, s_code, t_code, offset[index[0], index[1]], r, config, upright)
+        return dataclasses.replace(found, off_own=jnp.maximum(own[0][index[0]], own[1][index[1]]))
 
     return jax.lax.map(one, pairs, batch_size=AT_ONCE)
+
+
+def off_own(prior: Prior, surfaces: Surface, codes: Embedding) -> Float[Array, " n"]:
+    """How far the samples of clouds lie off the surfaces that the prior completes them to: 0 to 1."""
+
+    def one(row: tuple[Surface, Embedding]) -> Float[Array, ""]:
+        surface, code = row
+        return off_field(prior, jaxlie.SE3.identity(), surface.sampled, code)
+
+    return jax.lax.map(one, (surfaces, codes))
 
 
 def fit(
@@ -115,6 +140,7 @@ def fit(
         radius=radius,
         off_source=off[0, 0],
         off_target=off[0, 1],
+        off_own=jnp.zeros(()),
         poses=jaxlie.SE3.from_rotation_and_translation(poses.rotation(), poses.translation() * radius),
     )
 
@@ -150,6 +176,7 @@ class Calibration:
 
 
 HIGHEST = 0.2
+UNKNOWN = 0.5  # of `off_own`: a prior that lays a cloud so far off its own surface has no say
 # Logistic regression on pairs of validation rooms; how, and how well it holds, is in docs/relocalisation.md.
 UPRIGHT = Calibration(intercept=3.7, nearer=-6.9, farther=-1.0, size=-2.7, likeness=2.6, lift=-2.5, top=-21.0)
 FREE = Calibration(
@@ -160,11 +187,18 @@ UNASKED = Calibration(
 )  # without the prior's say
 
 
-def calibration(config: RegistrationConfig, upright: bool) -> Calibration:
-    """What the evidence of these settings was calibrated to; `upright`: things stand on the floor of one frame."""
+def calibrated(
+    evidence: Evidence, compared: Compared, config: RegistrationConfig, upright: bool
+) -> Float[np.ndarray, "*pairs"]:
+    """`log_odds` as these settings were calibrated; `upright`: things stand on the floor of one frame.
+
+    Weights that know nothing of a pair's clouds have no say in it."""
     if upright:
-        return UPRIGHT
-    return FREE if asks_prior(config, upright) else UNASKED
+        return log_odds(evidence, compared, UPRIGHT)
+    unasked = log_odds(evidence, compared, UNASKED)
+    if not asks_prior(config, upright):
+        return unasked
+    return np.where(np.asarray(evidence.off_own) <= UNKNOWN, log_odds(evidence, compared, FREE), unasked)
 
 
 def log_odds(evidence: Evidence, compared: Compared, c: Calibration) -> Float[np.ndarray, "*pairs"]:

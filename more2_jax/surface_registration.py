@@ -172,17 +172,19 @@ def off_fields(
     target's from that of the source: 0 on it, 1 `OFF_FIELD` away. A pose that is not finite has 1."""
     source, target = (s.sampled for s in surfaces)
 
-    def one_way(T: jaxlie.SE3, cloud: Sampled, code: Embedding) -> Float[Array, ""]:
-        distance = jnp.abs(field_sdf(prior, object_field(prior, code), transformed(T, cloud.points)))
-        share = jnp.where(cloud.mask, jnp.minimum(distance / OFF_FIELD, 1.0), 0.0)
-        mean = share.sum() / jnp.maximum(cloud.mask.sum(), 1)
-        return jnp.where(jnp.isfinite(mean), mean, 1.0)
-
     def both_ways(T: jaxlie.SE3) -> Float[Array, "2"]:
-        there = one_way(T, source, pair.target_code)
-        return jnp.stack([there, one_way(T.inverse(), target, pair.source_code)])
+        there = off_field(prior, T, source, pair.target_code)
+        return jnp.stack([there, off_field(prior, T.inverse(), target, pair.source_code)])
 
     return jax.vmap(both_ways)(poses)
+
+
+def off_field(prior: Prior, T: jaxlie.SE3, cloud: Sampled, code: Embedding) -> Float[Array, ""]:
+    """How far a moved sample lies off the completed surface of `code`, as in `off_fields`."""
+    distance = jnp.abs(field_sdf(prior, object_field(prior, code), transformed(T, cloud.points)))
+    share = jnp.where(cloud.mask, jnp.minimum(distance / OFF_FIELD, 1.0), 0.0)
+    mean = share.sum() / jnp.maximum(cloud.mask.sum(), 1)
+    return jnp.where(jnp.isfinite(mean), mean, 1.0)
 
 
 def lowest_apart(cost: Float[Array, " n"], rotation: jaxlie.SO3, count: int) -> Int[Array, " count"]:

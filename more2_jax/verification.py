@@ -23,7 +23,7 @@ from more2_jax.batching import bucket
 from more2_jax.color import color_evidence
 from more2_jax.config import SceneConfig
 from more2_jax.encoding import at_zero, padded, stack, with_origin
-from more2_jax.evidence import HYPOTHESES, Compared, calibration, log_odds, pair_evidence
+from more2_jax.evidence import HYPOTHESES, Compared, calibrated, pair_evidence
 from more2_jax.prior import Prior
 from more2_jax.types import Color, Embedding, Sight
 
@@ -91,7 +91,7 @@ def fit_pairs(prior: Prior, old: Sequence[Known], new: Sequence[Known], config: 
         evidence.poses, np.asarray(target.origin)[rows[:, 0]], np.asarray(source.origin)[rows[:, 1]]
     )
     of_candidates = Compared(**{k: v[candidates] for k, v in vars(known).items()})
-    result[candidates] = log_odds(evidence, of_candidates, calibration(config.registration, config.upright))
+    result[candidates] = calibrated(evidence, of_candidates, config.registration, config.upright)
     return PairFits(odds=result, T_old_new=poses)
 
 

@@ -4,6 +4,7 @@ import dataclasses
 
 import jax
 import jax.numpy as jnp
+import jaxlie
 import numpy as np
 import pytest
 from scipy.special import expit
@@ -15,16 +16,17 @@ from more2_jax.evidence import (
     FREE,
     HIGHEST,
     UNASKED,
+    UNKNOWN,
     UPRIGHT,
     Calibration,
     Compared,
     Evidence,
-    calibration,
+    calibrated,
     log_odds,
     pair_evidence,
 )
 from more2_jax.starts import Pair
-from more2_jax.surface_registration import LIFTED, off_fields
+from more2_jax.surface_registration import LIFTED, off_field, off_fields
 from more2_jax.verification import (
     NEVER,
     Known,
@@ -72,7 +74,7 @@ def test_a_copy_that_went_makes_the_other_interchangeable_and_far_motion_alone_r
 def test_log_odds_are_linear_and_the_two_ways_have_no_order():
     rng = np.random.default_rng(0)
     values = {k: rng.uniform(size=3) for k in ("of_source", "of_target", "off_source", "off_target", "lift")}
-    evidence = Evidence(radius=np.full(3, 0.5), poses=None, **values)
+    evidence = Evidence(radius=np.full(3, 0.5), poses=None, off_own=np.zeros(3), **values)
     known = Compared(**{k: rng.uniform(size=3) for k in ("size", "likeness", "top_m", "color")})
     c = Calibration(
         intercept=1.0,
@@ -93,10 +95,23 @@ def test_log_odds_are_linear_and_the_two_ways_have_no_order():
     np.testing.assert_allclose(log_odds(evidence, known, c), by_hand)
 
 
-def test_the_prior_is_asked_in_any_orientation_alone_and_only_where_it_may_choose():
+def test_the_prior_is_asked_in_any_orientation_alone_and_only_where_it_knows_the_clouds():
+    rng = np.random.default_rng(0)
+    fields = ("of_source", "of_target", "off_source", "off_target", "lift")
+    evidence = Evidence(
+        radius=np.full(3, 0.5),
+        poses=None,
+        off_own=np.array([0.0, UNKNOWN, UNKNOWN + 0.1]),
+        **{k: rng.uniform(size=3) for k in fields},
+    )
+    known = Compared(**{k: rng.uniform(size=3) for k in ("size", "likeness", "top_m", "color")})
     upright, free = (preset("robust", upright=u).registration for u in (True, False))
-    assert calibration(upright, True) is UPRIGHT and calibration(free, False) is FREE
-    assert calibration(dataclasses.replace(free, field_weight=0.0), False) is UNASKED
+    by = {c: log_odds(evidence, known, c) for c in (UPRIGHT, FREE, UNASKED)}
+    np.testing.assert_array_equal(calibrated(evidence, known, upright, True), by[UPRIGHT])
+    found = calibrated(evidence, known, free, False)
+    np.testing.assert_array_equal(found, [*by[FREE][:2], by[UNASKED][2]])
+    without = dataclasses.replace(free, field_weight=0.0)
+    np.testing.assert_array_equal(calibrated(evidence, known, without, False), by[UNASKED])
     assert not (UPRIGHT.off_less or UPRIGHT.off_more or UNASKED.off_less or UNASKED.off_more)
 
 
@@ -116,6 +131,9 @@ def test_in_any_orientation_the_evidence_is_that_of_the_best_pose(tiny_prior):
     pair = Pair(source=sampled[0], target=sampled[1], source_code=a, target_code=b, offset=jnp.zeros(3))
     off = off_fields(tiny_prior, T, pair, surfaces)
     np.testing.assert_allclose([found.off_source[0], found.off_target[0]], off[0], atol=1e-3)
+    stay = jaxlie.SE3.identity()
+    own = [off_field(tiny_prior, stay, c, e) for c, e in ((sampled[0], a), (sampled[1], b))]
+    np.testing.assert_allclose(found.off_own[0], max(own), atol=1e-3)
 
 
 def test_what_is_left_over_is_gone_unless_another_left_over_may_be_it():
