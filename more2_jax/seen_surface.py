@@ -85,7 +85,7 @@ class SeenSurface:
 
         Normal, way to the neighbour, height of the point over the neighbour's plane, how far the two face alike.
         """
-        near = self.neighbours[:, :ASKED]
+        near = self.neighbours[:, :ASKED].copy()
         near[:, 0] = np.arange(len(near))  # where points are doubled, the first may be another
         normal, toward = self.normal[near], self.points[near] - self.points[:, None]
         height = np.einsum("nki,nki->nk", normal, self.points[:, None] - self.center[near])
