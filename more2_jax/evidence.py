@@ -48,13 +48,11 @@ class Evidence:
     of_target: Float[Array, "*pairs"]  # and of the target's
     lift: Float[Array, "*pairs"]  # change of height, metres
     radius: Float[Array, "*pairs"]  # of the target, metres
-    off_source: Float[
-        Array, "*pairs"
-    ]  # how far the source's points lie off the target's completed surface: 0 to 1
-    off_target: Float[Array, "*pairs"]  # and the target's off the source's; all 0 where that is not asked
-    off_own: Float[
-        Array, "*pairs"
-    ]  # how far either lies off its own at most: what the prior does not even know
+    # How far, 0 to 1, the source's points lie off the target's completed surface, the target's off the source's, and
+    # either off its own at most: what the prior does not even know. All 0 where that is not asked.
+    off_source: Float[Array, "*pairs"]
+    off_target: Float[Array, "*pairs"]
+    off_own: Float[Array, "*pairs"]
     poses: jaxlie.SE3  # (*pairs, `HYPOTHESES`): source's local frame to target's, best first, metres
 
 
@@ -182,9 +180,8 @@ UPRIGHT = Calibration(intercept=3.7, nearer=-6.9, farther=-1.0, size=-2.7, liken
 FREE = Calibration(
     intercept=2.6, nearer=-6.9, farther=0.0, size=-4.0, likeness=7.25, off_less=-11.1, off_more=-6.5
 )
-UNASKED = Calibration(
-    intercept=1.2, nearer=-9.9, farther=-3.3, size=-4.2, likeness=5.7
-)  # without the prior's say
+# Without the prior's say.
+UNASKED = Calibration(intercept=1.2, nearer=-9.9, farther=-3.3, size=-4.2, likeness=5.7)
 
 
 def calibrated(

@@ -22,7 +22,7 @@ def outlier_factors(points: Points) -> Float[np.ndarray, " n"]:
     """
     if len(points) <= NEIGHBOURS:
         return np.ones(len(points))
-    distance, near = KDTree(points).query(points, k=NEIGHBOURS + 1, workers=-1)
+    distance, near = KDTree(points).query(points, k=NEIGHBOURS + 1)
     own = np.asarray(distance)[:, 1:].mean(axis=1)
     around = own[np.asarray(near)[:, 1:]].mean(axis=1)
     return np.divide(own, around, out=np.ones(len(points)), where=around > 0)
