@@ -35,7 +35,9 @@ from more2_jax.surface_registration import (
 from more2_jax.types import Embedding, PointCloud, pytree, scale_embedding
 
 HYPOTHESES = 4  # poses of a pair that are remembered: the best, and others turned otherwise
-AT_ONCE = 8  # pairs aligned side by side: as many as a small CPU has use for
+# Pairs aligned side by side: a small CPU has use for few, an accelerator for all of a scene.
+AT_ONCE = {"cpu": 8}
+AT_ONCE_OF_OTHERS = 64
 
 
 @pytree
@@ -92,7 +94,8 @@ def pair_evidence(
         found = fit(prior, s, t, s_code, t_code, offset[index[0], index[1]], r, config, upright)
         return dataclasses.replace(found, off_own=jnp.maximum(own[0][index[0]], own[1][index[1]]))
 
-    return jax.lax.map(one, pairs, batch_size=AT_ONCE)
+    at_once = AT_ONCE.get(jax.default_backend(), AT_ONCE_OF_OTHERS)
+    return jax.lax.map(one, pairs, batch_size=at_once)
 
 
 def off_own(prior: Prior, surfaces: Surface, codes: Embedding) -> Float[Array, " n"]:

@@ -22,11 +22,12 @@ from more2_jax.seen_surface import SeenSurface, seen_surface, some_of
 from more2_jax.types import Embedding, Mesh
 
 # Queries a call: one compiled program for every object and resolution. On a CPU the layers' values should stay in the
-# caches (2048 take 0.6 times as long as 8192 at a time); accelerators want large products.
-CHUNK = {"cpu": 2048}
+# caches (2048 take 0.6 times as long as 8192 at a time); accelerators want large products where there is much to ask.
+FEW = 2048
+CHUNK = {"cpu": FEW}
 CHUNK_OF_OTHERS = 32768
-SLOPES = 2048  # points at most where the field's slope is asked; it has little to say at the others either
-OBSERVED = 2048  # and where its level is
+SLOPES = FEW  # points at most where the field's slope is asked; it has little to say at the others either
+OBSERVED = FEW  # and where its level is
 
 Ask = Callable[[Float[np.ndarray, "p 3"]], Float[np.ndarray, " p"]]  # the field at queries,
 Draw = Callable[
@@ -134,10 +135,10 @@ def _in_chunks(
     embedding: Embedding,
     queries: Float[np.ndarray, "p 3"],
 ) -> Float[np.ndarray, "p *_"]:
-    """What `of` gives at canonical offsets, asked for in chunks of one fixed size."""
+    """What `of` gives at canonical offsets, asked for in chunks of a fixed size: one for few, one for many."""
     local = dataclasses.replace(embedding, origin=jnp.zeros(3))
     points = (queries * float(embedding.scale) + np.asarray(embedding.center)).astype(np.float32)
-    chunk = CHUNK.get(jax.default_backend(), CHUNK_OF_OTHERS)
+    chunk = FEW if len(points) <= FEW else CHUNK.get(jax.default_backend(), CHUNK_OF_OTHERS)
     padded = np.zeros((-(-max(len(points), 1) // chunk) * chunk, 3), np.float32)
     padded[: len(points)] = points
     parts = [of(prior, local, jnp.asarray(part)) for part in padded.reshape(-1, chunk, 3)]
