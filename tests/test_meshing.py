@@ -11,6 +11,7 @@ from shapes import box_distance
 
 from more2_jax import meshing
 from more2_jax.config import MeshingConfig
+from more2_jax.encoding import embed
 from more2_jax.lattice import cube
 from more2_jax.meshing import extract_mesh, observed_level
 from more2_jax.types import Embedding
@@ -199,3 +200,15 @@ def test_a_field_asked_less_finely_is_interpolated(field_is, tiny_prior):
     radius = np.linalg.norm(canonical(some), axis=1)
     assert 1e-4 < np.abs(radius - 0.4).max() < most
     assert solid(some).is_watertight
+
+
+@pytest.mark.parametrize("count", [100, 3000])
+def test_values_do_not_depend_on_how_many_are_asked_at_once(tiny_prior, count, monkeypatch):
+    embedding = embed(tiny_prior, [np.random.default_rng(0).normal(size=(300, 3))])[0]
+    queries = np.random.default_rng(1).uniform(-0.5, 0.5, (count, 3))
+    few = meshing._in_chunks(meshing._values, tiny_prior, embedding, queries)
+    monkeypatch.setattr(meshing, "CHUNK", {})
+    monkeypatch.setattr(meshing, "CHUNK_OF_OTHERS", 4096)
+    many = meshing._in_chunks(meshing._values, tiny_prior, embedding, queries)
+    assert few.shape == many.shape == (count,)
+    np.testing.assert_allclose(many, few, atol=1e-6)
