@@ -2,7 +2,8 @@
 
 You learn: stages take `Embedding` records and do not care who made them. Needed are an invariant code `inv`, columns
 `eqv` that turn with the object, a `scale` and a `center`. Here they come from the principal axes of the cloud: no
-network, no weights. `register` still takes a prior, since its loss asks the decoder; weight 0 leaves that out.
+network, no weights. `register` still takes a prior: among poses that fit about as well it asks the decoder, which knows
+only its own encoder's records; a `field_weight` of 0 leaves that out.
 """
 
 import dataclasses
@@ -61,7 +62,7 @@ right = [a.model == b.model for a, b in names]
 print(f"matched by the own descriptor alone: {sum(right)} of 6 right, {len(right) - sum(right)} wrong")
 
 rows_new, rows_old = (np.array(side) for side in zip(*pairs, strict=True))
-registration = dataclasses.replace(config.registration, sdf_weight=0.0)
+registration = dataclasses.replace(config.registration, field_weight=0.0)
 found = m2.register(
     prior,
     jax.tree.map(lambda x: x[rows_new], new),

@@ -85,6 +85,16 @@ def encode(prior: Prior, cloud: PointCloud) -> Embedding:
     return dataclasses.replace(_encode_many(prior, cloud.points, cloud.mask), origin=cloud.origin)
 
 
+def check_embedding(prior: Prior, embedding: Embedding, who: str) -> None:
+    """Raises ValueError unless the decoder can be asked about the embedding, which another encoder may have made."""
+    needed, got = len(prior.config.decoder.local_blocks), len(embedding.anchors)
+    if got != needed:
+        raise ValueError(
+            f"{who} got embeddings with {got} levels of anchors; the decoder of prior {prior.name!r} needed {needed}, "
+            "as its own encoder makes"
+        )
+
+
 def object_field(prior: Prior, embedding: Embedding) -> ObjectField:
     """Folds one object's code into the decoder; then `field_sdf` is cheap for many points."""
     decoder = Decoder(prior.config)
@@ -112,8 +122,10 @@ def sdf(
 ) -> Float[Array, "b n"]:
     """Signed distances of a batch of objects at points in each scan's frame (metres), canonical units.
 
-    Multiply by `embedding.scale` for metres; negative inside (paper §3.1). Raises ValueError on shapes that differ.
+    Multiply by `embedding.scale` for metres; negative inside (paper §3.1). Raises ValueError on shapes that differ, and
+    on embeddings that the decoder cannot be asked about.
     """
+    check_embedding(prior, embedding, "sdf")
     if points.ndim != 3 or points.shape[0] != embedding.scale.shape[0]:
         raise ValueError(
             f"sdf got points {points.shape} for {embedding.scale.shape} objects; needed (objects, n, 3)"

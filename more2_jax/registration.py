@@ -31,7 +31,7 @@ from more2_jax.geometry import (
     transformed,
     two_way_rms,
 )
-from more2_jax.prior import Prior, field_sdf, object_field
+from more2_jax.prior import Prior, check_embedding, field_sdf, object_field
 from more2_jax.sight import scale_sight
 from more2_jax.starts import Pair, candidate_poses
 from more2_jax.surface_registration import lowest_apart, register_surfaces
@@ -58,11 +58,15 @@ def register(
 
     Sights (`sight.padded_sights`, about the clouds' origins) say what sensors saw around each, where that is known.
     Returns local poses; `world_pose` makes them poses between the scans' frames. Raises ValueError when the
-    batches differ in size.
+    batches differ in size, and when the decoder cannot be asked about the embeddings: those of another encoder need
+    `config.refine` "surface" and a `field_weight` of 0.
     """
     sizes = [len(x) for x in (source.points, target.points, source_embedding.scale, target_embedding.scale)]
     if len(set(sizes)) != 1:
         raise ValueError(f"register got {sizes} sources, targets and their embeddings; needed equal numbers")
+    if config.refine != "surface" or config.field_weight:
+        check_embedding(prior, source_embedding, "register")
+        check_embedding(prior, target_embedding, "register")
     # How far the source's local zero lies from the target's, when both scans share a frame.
     offset = jnp.asarray(np.asarray(source.origin) - np.asarray(target.origin), jnp.float32)
     zero = jnp.zeros_like(offset)

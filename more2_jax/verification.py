@@ -23,8 +23,8 @@ from more2_jax.batching import bucket
 from more2_jax.color import color_evidence
 from more2_jax.config import SceneConfig
 from more2_jax.encoding import at_zero, padded, stack, with_origin
-from more2_jax.evidence import HYPOTHESES, Compared, calibrated, pair_evidence
-from more2_jax.prior import Prior
+from more2_jax.evidence import HYPOTHESES, Compared, asks_prior, calibrated, pair_evidence
+from more2_jax.prior import Prior, check_embedding
 from more2_jax.types import Color, Embedding, Sight
 
 Points = Float[np.ndarray, "_ 3"]
@@ -59,8 +59,12 @@ class PairFits:
 def fit_pairs(prior: Prior, old: Sequence[Known], new: Sequence[Known], config: SceneConfig) -> PairFits:
     """Aligns the likeliest pairs; all of `old` and `new` in one frame, or in two that differ by any motion.
 
-    Upright, the frames have one height (see `frames.common_height`).
+    Upright, the frames have one height (see `frames.common_height`). In any orientation the prior is asked (unless its
+    `field_weight` is 0), and embeddings that its decoder cannot be asked about are a ValueError.
     """
+    if asks_prior(config.registration, config.upright):
+        for k in (*old, *new):
+            check_embedding(prior, k.embedding, "match")
     known = compared(old, new)
     proposal = proposal_of(known, config)
     candidates = proposed(proposal, config.matching.candidates)

@@ -198,6 +198,24 @@ def test_batches_of_different_size_are_refused(tiny_prior, still):
         register(tiny_prior, two, three, a, b, PAPER)
 
 
+@pytest.mark.parametrize("config", [FREE, PAPER], ids=["robust", "paper"])
+def test_records_of_another_encoder_are_refused_where_the_decoder_would_be_asked(tiny_prior, config):
+    source, target = clouds_of(furniture()[:1]), clouds_of(furniture()[:1])
+    other = encode(tiny_prior, target)  # without anchors, which `small` looks up
+    with pytest.raises(ValueError, match=r"register got embeddings with 0 levels of anchors.*needed 2"):
+        register(load_prior("small"), source, target, other, other, config)
+
+
+def test_records_of_another_encoder_are_registered_where_the_prior_is_not_asked(tiny_prior):
+    clouds, rng = furniture(), np.random.default_rng(1)
+    poses = [pieces.random_pose(rng, upright=True) for _ in clouds]
+    source, target = clouds_of(clouds), clouds_of(moved(clouds, poses))
+    codes = [encode(tiny_prior, c) for c in (source, target)]  # without anchors, which `small` looks up
+    unasked = dataclasses.replace(UPRIGHT, field_weight=0.0)
+    result = register(load_prior("small"), source, target, *codes, unasked, True)
+    assert_recovered(world_poses(result, source, target), poses, clouds)
+
+
 def test_scenes_of_like_size_share_one_program(tiny_prior, still):
     programs = []
     for count in (5, 7):

@@ -25,6 +25,7 @@ from more2_jax.evidence import (
     log_odds,
     pair_evidence,
 )
+from more2_jax.prior import load_prior
 from more2_jax.starts import Pair
 from more2_jax.surface_registration import LIFTED, off_field, off_fields
 from more2_jax.verification import (
@@ -165,3 +166,10 @@ def test_geometry_tells_boxes_of_one_size_but_different_shape_apart(tiny_prior):
     odds = fit_pairs(tiny_prior, known[0], known[1], preset("robust", upright=True)).odds
     assert odds.shape == (2, 2)
     assert min(odds[0, 1], odds[1, 0]) > max(odds[0, 0], odds[1, 1]) + 1
+
+
+def test_records_of_another_encoder_are_refused_where_the_prior_has_a_say(tiny_prior):
+    cloud = box(np.random.default_rng(0), np.array([1.0, 0.5, 0.6]))
+    known = [Known(points=cloud, embedding=embed(tiny_prior, [cloud])[0])]
+    with pytest.raises(ValueError, match=r"match got embeddings with 0 levels of anchors.*needed 2"):
+        fit_pairs(load_prior("small"), known, known, preset("robust"))
