@@ -59,12 +59,9 @@ class PairFits:
 def fit_pairs(prior: Prior, old: Sequence[Known], new: Sequence[Known], config: SceneConfig) -> PairFits:
     """Aligns the likeliest pairs; all of `old` and `new` in one frame, or in two that differ by any motion.
 
-    Upright, the frames have one height (see `frames.common_height`). In any orientation the prior is asked (unless its
-    `field_weight` is 0), and embeddings that its decoder cannot be asked about are a ValueError.
+    Upright, the frames have one height (see `frames.common_height`). Raises ValueError as `check_known` does.
     """
-    if asks_prior(config.registration, config.upright):
-        for k in (*old, *new):
-            check_embedding(prior, k.embedding, "match")
+    check_known(prior, (*old, *new), config)
     known = compared(old, new)
     proposal = proposal_of(known, config)
     candidates = proposed(proposal, config.matching.candidates)
@@ -97,6 +94,13 @@ def fit_pairs(prior: Prior, old: Sequence[Known], new: Sequence[Known], config: 
     of_candidates = Compared(**{k: v[candidates] for k, v in vars(known).items()})
     result[candidates] = calibrated(evidence, of_candidates, config.registration, config.upright)
     return PairFits(odds=result, T_old_new=poses)
+
+
+def check_known(prior: Prior, known: Sequence[Known], config: SceneConfig) -> None:
+    """Raises ValueError where the prior is asked (any orientation, `field_weight`) about another encoder's records."""
+    if asks_prior(config.registration, config.upright):
+        for k in known:
+            check_embedding(prior, k.embedding, "match")
 
 
 def in_frames(
