@@ -49,7 +49,6 @@ KERNELS = (
     "top_k",
     "gather",
     "scatter",
-    "scatter-add",
     "reduce_",
     "arg",
     "cum",

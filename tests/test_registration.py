@@ -18,7 +18,7 @@ from more2_jax.batching import pad_batch, pad_clouds
 from more2_jax.config import RegistrationConfig, preset
 from more2_jax.encoding import SMALLEST_BATCH, at_zero, padded, stack, unstack
 from more2_jax.geometry import sample
-from more2_jax.prior import encode, encode_one, load_prior, shipped_priors
+from more2_jax.prior import encode, encode_one, load_prior, sdf, shipped_priors
 from more2_jax.registration import register, register_one, world_pose
 from more2_jax.starts import Pair
 from more2_jax.surface_registration import APART_DEG, lowest_apart
@@ -204,6 +204,8 @@ def test_records_of_another_encoder_are_refused_where_the_decoder_would_be_asked
     other = encode(tiny_prior, target)  # without anchors, which `small` looks up
     with pytest.raises(ValueError, match=r"register got embeddings with 0 levels of anchors.*needed 2"):
         register(load_prior("small"), source, target, other, other, config)
+    with pytest.raises(ValueError, match=r"sdf got embeddings with 0 levels of anchors.*needed 2"):
+        sdf(load_prior("small"), other, np.zeros((BATCH, 1, 3)))
 
 
 def test_records_of_another_encoder_are_registered_where_the_prior_is_not_asked(tiny_prior):
