@@ -174,7 +174,8 @@ class TrainingConfig:
     batch: int = 64  # shapes; two partial clouds each
     learning_rate: float = 1e-4
     warmup_steps: int = 200
-    schedule: Literal["cosine", "steps"] = "cosine"  # or ×0.3 at 60, 75 and 90 % of the steps, as published
+    # or ×0.3 at 60, 75 and 90 % of the steps, as published; or constant, and falling in the last fifth
+    schedule: Literal["cosine", "steps", "trapezoid"] = "cosine"
     clip: float = 1.0
     ema: float = 0.999
     queries: int = 1024  # a cloud: half uniform, half near the surface

@@ -130,6 +130,17 @@ def test_the_published_schedule_drops_thrice_and_the_cosine_ends_at_a_hundredth(
     np.testing.assert_allclose([float(cosine(n)) for n in (0, 100, 1000)], [0, 1, 0.01], rtol=1e-5)
 
 
+def test_a_trapezoid_may_be_given_other_steps_while_it_is_flat(run):
+    training = dataclasses.replace(
+        run.training, schedule="trapezoid", steps=1000, warmup_steps=100, learning_rate=1.0
+    )
+    short, long = learning_rate(training), learning_rate(dataclasses.replace(training, steps=5000))
+    at = [float(short(n)) for n in (0, 50, 100, 800, 900, 1000, 1200)]
+    np.testing.assert_allclose(at, [0, 0.5, 1, 1, 0.505, 0.01, 0.01], rtol=1e-5)
+    assert [float(short(n)) for n in range(0, 801, 50)] == [float(long(n)) for n in range(0, 801, 50)]
+    np.testing.assert_allclose([float(long(n)) for n in (4000, 4500, 5000)], [1, 0.505, 0.01], rtol=1e-5)
+
+
 def test_packed_shapes_are_the_shards_to_within_a_step(shards, tmp_path):
     packed = tmp_path / "small.npz"
     pack.main((shards,), packed, shapes=10, val=4, views=2, points=32, queries=50)
