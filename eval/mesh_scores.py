@@ -2,7 +2,8 @@
 
 `paper`: the printed formulas, canonical units (longest edge 0.9). `published`: as the published code computes them:
 its Chamfer-L1 is squared and against vertices, its IoU the share of true vertices inside. `strict`: metres, true
-IoU, and samples spread evenly over the true surface, where vertices crowd where a model has detail.
+IoU, and distances from samples of one surface to the other surface itself. Between samples of both even equal
+surfaces are apart by half the spacing: 0.5 cm of furniture at 20,000 samples.
 """
 
 from __future__ import annotations
@@ -64,14 +65,14 @@ def mesh_scores(mesh: Mesh | None, truth: KnownObject, T_frame_model: Pose, samp
         apply_pose(np.linalg.inv(T_frame_model), mesh.vertices), mesh.faces, process=False
     )
     points, true_points = surface_points(found, samples), surface_points(true, samples)
-    there = KDTree(true_points).query(points)[0]
-    back = KDTree(points).query(true_points)[0]
+    there, back = to_surface(points, true), to_surface(true_points, found)
+    sampled = KDTree(true_points).query(points)[0].mean() + KDTree(points).query(true_points)[0].mean()
     tolerance = TOLERANCE * float(np.linalg.norm(np.ptp(true.vertices, axis=0)))
     near = NEAR / truth.canonical
     published = _published(found, true, points, truth.canonical)
     return {
         **published,
-        "chamfer.paper": float(there.mean() + back.mean()) / 2 * truth.canonical,
+        "chamfer.paper": float(sampled) / 2 * truth.canonical,
         "chamfer_m.strict": float(there.mean() + back.mean()) / 2,
         "accuracy_m": float(there.mean()),
         "completeness_m": float(back.mean()),
@@ -104,6 +105,15 @@ def surface_points(mesh: trimesh.Trimesh, count: int) -> Points:
     """Points spread over the surface by area, the same every time, in no order."""
     points = np.asarray(trimesh.sample.sample_surface(mesh, count, seed=0)[0])
     return np.random.default_rng(0).permutation(points)
+
+
+def to_surface(points: Points, mesh: trimesh.Trimesh) -> Float[np.ndarray, " n"]:
+    """How far points are from the nearest of a mesh's triangles."""
+    vertices, faces = (
+        np.array(mesh.vertices, np.float64, order="C"),
+        np.array(mesh.faces, np.int32, order="C"),
+    )
+    return np.abs(pcu.closest_points_on_mesh(np.array(points, np.float64, order="C"), vertices, faces)[0])
 
 
 def f_score(precision: float, recall: float) -> float:

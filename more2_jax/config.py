@@ -139,6 +139,8 @@ class MeshingConfig:
     )
     # On grids finer than `field_resolution`, so near (canonical units) to seen points their sides count, not its.
     screening: float = 0.0
+    # … where several scans saw the object and points lie in their planes without noise to speak of; 0: as near.
+    screening_of_many: float = 0.0
     # A seen point whose local outlier factor is larger is no surface: where one scan saw the object, and where several
     # did, which confirm one another. 0: all points count.
     outlier_factor: float = 0.0
@@ -222,6 +224,7 @@ ROBUST_MESHING = MeshingConfig(
     level="observed",
     seen_reach=0.02,
     screening=0.12,
+    screening_of_many=0.3,
     outlier_factor=1.5,
     outlier_factor_of_many=1.25,
     floor=True,

@@ -179,13 +179,14 @@ def _sided(through: SeenSurface, config: MeshingConfig, lowest: float, level: Le
     what is inside and what was seen.
     """
     seen = level.lattice.near(through.points, 0.0)
-    level = level.around(seen | (level.field < 0), config.screening)
+    length = (through.exact and config.screening_of_many) or config.screening
+    level = level.around(seen | (level.field < 0), length)
     step = finest if through.resolves(finest) else level.lattice.step / 2
     lattice, field = level.lattice, level.field
     while lattice.step > 1.5 * step:
         lattice, field = lattice.finer(), doubled(field)
     below = lowest - lattice.low[2] - lattice.step * np.arange(lattice.shape[2])
-    field = through.screened(np.maximum(field, below), lattice, config.screening)
+    field = through.screened(np.maximum(field, below), lattice, length)
     near, values = lattice.near(through.points, through.farthest), field.copy()
     values[near] = through.corrected(lattice.at(np.argwhere(near)), field[near])
     return Level(lattice, field, np.maximum(values, below))

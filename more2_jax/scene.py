@@ -159,8 +159,15 @@ def mesh_of(prior: Prior, o: SceneObject, scans: Sequence[ScanRecord], config: S
     points, eyes = trusted(o, scans, config)
     level = observed_level(prior, o.embedding, points) if config.meshing.level == "observed" else 0.0
     floor = floor_under(o, scans[o.reference_scan].background, config)
-    half = box_half_width(o, config)
-    return extract_mesh(prior, o.embedding, config.meshing, half, level, points, floor, eyes)
+    half, meshing = box_half_width(o, config), config.meshing
+    if not seen_often(o):
+        meshing = dataclasses.replace(meshing, screening_of_many=0.0)
+    return extract_mesh(prior, o.embedding, meshing, half, level, points, floor, eyes)
+
+
+def seen_often(o: SceneObject) -> bool:
+    """Whether several scans make up its shape."""
+    return len(accumulated(o)) > 1
 
 
 def trusted(
@@ -169,8 +176,7 @@ def trusted(
     """What was seen of an object without outliers, thinned, in its frame; and from where, if that is known and used."""
     points = some_of(accumulated_points(o))
     eyes = seen_from(o, scans) if config.meshing.seen_reach else None
-    many = len(accumulated(o)) > 1
-    most = config.meshing.outlier_factor_of_many if many else config.meshing.outlier_factor
+    most = config.meshing.outlier_factor_of_many if seen_often(o) else config.meshing.outlier_factor
     kept = inliers(points, most)
     return points[kept], None if eyes is None else some_of(eyes)[kept]
 

@@ -20,7 +20,10 @@ from more2_jax.orientation import outward_signs
 from more2_jax.screened_poisson import areas, screened
 
 NEIGHBOURS = 12  # points of a plane
-ASKED = 8  # planes a query hears, of the point nearest to it and of that point's neighbours
+EXACT = 0.1  # share of their own spread: points that lie off their planes by less are exact, and their edges are sharp
+OF_FACE = 6  # points of a plane, where they are exact
+ASKED = 8  # planes a query hears, of the point nearest to it and of that point's neighbours,
+ASKED_OF_EXACT = 4  # fewer where noise need not be averaged away
 MOST = 16_384  # points that are kept
 GAP = 3.0  # median distances between neighbours
 LEAST_GAP = 1e-3  # canonical units; where points are doubled
@@ -37,13 +40,14 @@ class SeenSurface:
     """Planes through neighbouring points, oriented; canonical units, relative to the object's centre."""
 
     tree: KDTree  # of the points the planes belong to
-    center: Points  # of each plane: its points' mean, which has less of their noise
+    center: Points  # of each plane: its points' mean, which has less of their noise, or the point if that is exact
     normal: Points  # unit length, outward
     area: Float[np.ndarray, " _"]  # the share of the surface that each stands for
     neighbours: Int[np.ndarray, "_ k"]  # of every point, nearest first
     reach: float  # off a plane, at this distance, its say has fallen to 1/e
     gap: float  # and along it, at this distance from the nearest point: it also holds between neighbours
     roughness: float  # how far off the planes their points lie, typically
+    exact: bool  # so little that noise does not show
 
     @property
     def points(self) -> Points:
@@ -85,7 +89,7 @@ class SeenSurface:
 
         Normal, way to the neighbour, height of the point over the neighbour's plane, how far the two face alike.
         """
-        near = self.neighbours[:, :ASKED].copy()
+        near = self.neighbours[:, : ASKED_OF_EXACT if self.exact else ASKED].copy()
         near[:, 0] = np.arange(len(near))  # where points are doubled, the first may be another
         normal, toward = self.normal[near], self.points[near] - self.points[:, None]
         height = np.einsum("nki,nki->nk", normal, self.points[:, None] - self.center[near])
@@ -119,15 +123,34 @@ def seen_surface(
         return None
     tree = KDTree(points)
     apart, neighbours = map(np.asarray, tree.query(points, k=NEIGHBOURS))
-    center = points[neighbours].mean(axis=1)
-    offset = points[neighbours] - center[:, None]
-    spread, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", offset, offset) / NEIGHBOURS)
-    normal, roughness = axes[:, :, 0], float(np.sqrt(max(0.0, np.median(spread[:, 0]))))
+    center, normal, spread = fitted(points, neighbours)
+    roughness = float(np.sqrt(max(0.0, np.median(spread[:, 0]))))
+    if exact := roughness < EXACT * float(np.sqrt(np.median(spread.sum(axis=1)))):
+        center, normal = points, facing(points, neighbours)
     around = slope[neighbours].sum(axis=1)
     rise = np.einsum("ni,ni->n", normal, around) / np.maximum(np.linalg.norm(around, axis=1), 1e-9)
     gap = GAP * max(float(np.median(apart[:, 1])), LEAST_GAP)
     signs = outward_signs(tree, normal, rise, gap, lowest, seen_from)
     normal = signs[:, None] * normal
-    return SeenSurface(
-        tree, center, normal, areas(points, normal, apart, neighbours), neighbours, reach, gap, roughness
-    )
+    area = areas(points, normal, apart, neighbours)
+    return SeenSurface(tree, center, normal, area, neighbours, reach, gap, roughness, exact)
+
+
+def fitted(points: Points, near: Int[np.ndarray, "n k"]) -> tuple[Points, Points, Float[np.ndarray, "n 3"]]:
+    """The planes of least squares through each point's neighbours: a point of each, its normal (of either sign), and
+    the neighbours' variances along its axes, that of the normal first."""
+    center = points[near].mean(axis=1)
+    offset = points[near] - center[:, None]
+    spread, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", offset, offset) / near.shape[1])
+    return center, axes[:, :, 0], spread
+
+
+def facing(points: Points, near: Int[np.ndarray, "n k"]) -> Points:
+    """Normals (of either sign) of exact points: of the plane around that its own points and this one lie best in.
+
+    So a point beside an edge has its face's normal, not the mean of two; of a thin leg's narrow sides likewise.
+    """
+    center, normal, spread = fitted(points, near[:, :OF_FACE])
+    off = np.einsum("nki,nki->nk", normal[near], points[:, None] - center[near])
+    best = (spread[near, 0] + off**2).argmin(axis=1)
+    return normal[near[np.arange(len(points)), best]]

@@ -178,6 +178,27 @@ def test_meshes_come_in_order_whichever_is_ready_first_and_errors_come_through(
         reconstruct(tiny_prior, bare, config)
 
 
+def test_several_scans_confirm_one_another_one_does_not(monkeypatch, tiny_prior, scene):
+    """Of what several scans saw more is an outlier, and exact points' sides reach farther."""
+    asked = []
+    monkeypatch.setattr(
+        more2_jax.scene, "inliers", lambda p, most: asked.append(most) or np.ones(len(p), bool)
+    )
+    monkeypatch.setattr(
+        more2_jax.scene,
+        "extract_mesh",
+        lambda prior, code, meshing, *_: asked.append(meshing.screening_of_many),
+    )
+    often = scene.objects[0]
+    doubted = tuple(
+        dataclasses.replace(s, accumulated=s.scan == often.reference_scan) for s in often.observations
+    )
+    for o in (often, dataclasses.replace(often, observations=doubted)):
+        more2_jax.scene.mesh_of(tiny_prior, o, scene.scans, ROBUST)
+    assert len(often.observations) == 3
+    assert asked == [ROBUST.meshing.outlier_factor_of_many, 0.3, ROBUST.meshing.outlier_factor, 0.0]
+
+
 def test_without_joint_steps_codes_and_poses_stay_and_with_them_they_do_not(tiny_prior, scene):
     """The preset `robust` has none; `CONFIG` has three."""
     without = dataclasses.replace(CONFIG, joint=ROBUST.joint)

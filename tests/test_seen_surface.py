@@ -13,7 +13,7 @@ from more2_jax import meshing
 from more2_jax.config import MeshingConfig
 from more2_jax.lattice import cube
 from more2_jax.meshing import extract_mesh
-from more2_jax.seen_surface import FEWEST, MOST, seen_surface, some_of
+from more2_jax.seen_surface import FEWEST, MOST, fitted, seen_surface, some_of
 from more2_jax.types import Embedding
 
 REACH = 0.03
@@ -188,6 +188,37 @@ def test_a_grid_is_as_fine_as_the_points_are_exact(ball_of_036, tiny_prior, nois
     assert abs(np.median(radius) - 0.4) < 0.004 + noise / 4
 
 
+def leg(noise=0.0):
+    """The four sides of an upright square leg, 0.06 wide, and which way each point's side faces."""
+    rng = np.random.default_rng(0)
+    side, along, height = (
+        rng.integers(0, 4, 6000),
+        rng.uniform(-0.03, 0.03, 6000),
+        rng.uniform(-0.4, 0.4, 6000),
+    )
+    outward = np.array([[1.0, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0]])[side]
+    points = 0.03 * outward + along[:, None] * np.cross(outward, [0, 0, 1.0])
+    points[:, 2] = height
+    return points + noise * rng.normal(size=points.shape), outward
+
+
+def test_exact_points_beside_an_edge_face_as_their_side_does():
+    points, outward = leg()
+    found = seen_surface(points, points * [1, 1, 0], REACH)
+    assert found.exact and (found.center == points).all()
+    faces = np.einsum("ni,ni->n", found.normal, outward)
+    _, plain, _ = fitted(points, found.neighbours)
+    assert np.mean(faces > 0.99) > 0.97 > 0.9 > np.mean(np.abs(np.einsum("ni,ni->n", plain, outward)) > 0.99)
+
+
+def test_of_noisy_points_planes_stay_means():
+    points, _ = leg(noise=0.003)
+    found = seen_surface(points, points * [1, 1, 0], REACH)
+    center, normal, _ = fitted(points, found.neighbours)
+    assert not found.exact and (found.center == center).all()
+    np.testing.assert_allclose(np.abs(np.einsum("ni,ni->n", found.normal, normal)), 1.0)
+
+
 def bowl():
     """The inner half of a hollow ball of radius 0.4, seen alone: what lies behind it says nothing."""
     p = sphere(3000, 0.4)
@@ -215,3 +246,13 @@ def test_a_mesh_is_told_who_saw_its_points(ball_of_036, tiny_prior):
     asked = in_scan(np.array([[0.0, 0, 0], [0.33, 0, 0]]))
     for mesh, solid in ((shell, [False, True]), (whole, [True, False])):
         assert list(trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).contains(asked)) == solid
+
+
+@pytest.mark.parametrize(("noise", "solid"), [(0.0, False), (0.01, True)])
+def test_sides_of_exact_points_of_several_scans_reach_farther(ball_of_036, tiny_prior, noise, solid):
+    within = sphere(4000, 0.3) * (1 + noise * np.random.default_rng(0).normal(size=(4000, 1)))
+    config = dataclasses.replace(CONFIG, field_resolution=32, screening=0.03, screening_of_many=0.15)
+    places = np.broadcast_to(in_scan(np.zeros(3)), (len(within), 1, 3))
+    mesh = extract_mesh(tiny_prior, PIECE, config, seen=in_scan(within), seen_from=places)
+    middle = in_scan(np.zeros((1, 3)))
+    assert trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).contains(middle) == solid
