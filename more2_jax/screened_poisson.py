@@ -22,7 +22,6 @@ from scipy.fft import irfftn, next_fast_len, rfftn
 from more2_jax.lattice import Grid, Lattice, Points
 
 SOFT = 1.5  # cells on either side of the surface in which an indicator goes from 1 to 0
-MARGIN = 1.0  # screening lengths around the box, which the Fourier transform takes as periodic
 AGREE = 0.5  # cosine from which on a neighbour's normal is of the same face,
 CORNERS = np.array(list(itertools.product((0, 1), repeat=3)))  # of a cell
 FLAT = 0.1  # and share of its squared distance that it may lie off that face
@@ -35,16 +34,17 @@ def screened(
     normals: Points,
     area: Float[np.ndarray, " p"],
     length: float,
+    margin: float | None = None,
 ) -> Grid:
     """The field on a lattice, its sides near `points` put right; canonical units.
 
-    `normals` are unit and outward, `area` is the share of the surface each point stands for, `length` is ℓ. Near
-    the surface the result is nearly a distance; `SOFT` cells away from it, it is cut off.
+    `normals` are unit and outward, `area` is the share of the surface each point stands for, `length` is ℓ. The
+    Fourier transform takes the box as periodic, with so much empty space between as `margin` says, by default ℓ.
+    Near the surface the result is nearly a distance; `SOFT` cells away from it, it is cut off.
     """
-    step, shape = lattice.step, field.shape
+    step, shape, margin = lattice.step, field.shape, length if margin is None else margin
     prior = np.clip(0.5 - field / (2 * SOFT * step), 0.0, 1.0)
-    margin = int(np.ceil(MARGIN * length / step))
-    size = [next_fast_len(n + margin, real=True) or n for n in shape]
+    size = [next_fast_len(n + int(np.ceil(margin / step)), real=True) or n for n in shape]
     k = [
         2 * np.pi * f(n, step)
         for f, n in zip((np.fft.fftfreq, np.fft.fftfreq, np.fft.rfftfreq), size, strict=True)

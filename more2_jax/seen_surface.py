@@ -96,9 +96,9 @@ class SeenSurface:
         agree = np.maximum(np.einsum("nki,ni->nk", normal, self.normal), 0.0) ** ONE_FACE
         return np.concatenate([normal, toward, np.stack([height, agree], axis=2)], axis=2)
 
-    def screened(self, field: Grid, lattice: Lattice, length: float) -> Grid:
+    def screened(self, field: Grid, lattice: Lattice, length: float, margin: float) -> Grid:
         """The field on a lattice, its sides near what was seen put right; `length`: how far that reaches."""
-        return screened(field, lattice, self.points, self.normal, self.area, length)
+        return screened(field, lattice, self.points, self.normal, self.area, length, margin)
 
 
 def some_of(points: Float[np.ndarray, "n *_"], most: int = MOST) -> Float[np.ndarray, "m *_"]:
