@@ -109,11 +109,9 @@ def surface_points(mesh: trimesh.Trimesh, count: int) -> Points:
 
 def to_surface(points: Points, mesh: trimesh.Trimesh) -> Float[np.ndarray, " n"]:
     """How far points are from the nearest of a mesh's triangles."""
-    vertices, faces = (
-        np.array(mesh.vertices, np.float64, order="C"),
-        np.array(mesh.faces, np.int32, order="C"),
-    )
-    return np.abs(pcu.closest_points_on_mesh(np.array(points, np.float64, order="C"), vertices, faces)[0])
+    points, vertices = (np.array(x, np.float64, order="C") for x in (points, mesh.vertices))
+    faces = np.array(mesh.faces, np.int32, order="C")
+    return np.abs(pcu.closest_points_on_mesh(points, vertices, faces)[0])
 
 
 def f_score(precision: float, recall: float) -> float:

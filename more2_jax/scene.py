@@ -36,9 +36,8 @@ from more2_jax.types import Frame, Instance, LivingScene, Mesh, Scan, ScanRecord
 BACKGROUND_POINTS = 20_000  # of a scan, remembered for the page and for what its sensors looked through
 STRAYS = 0.02  # share of an object's points that may lie below the floor,
 BELOW_M = 0.05  # by more than this
-MESHES_AT_ONCE = (
-    8  # about 70 MB each: a scene of eight objects took 662 MB one at a time, 1,131 MB all at once
-)
+# About 70 MB each: a scene of eight objects took 662 MB one at a time, 1,131 MB all at once.
+MESHES_AT_ONCE = 8
 
 
 def start_scene(

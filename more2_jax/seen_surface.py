@@ -21,7 +21,8 @@ from more2_jax.screened_poisson import areas, screened
 
 NEIGHBOURS = 12  # points of a plane
 EXACT = 0.1  # share of their own spread: points that lie off their planes by less are exact, and their edges are sharp
-OF_FACE = 6  # points of a plane, where they are exact
+OF_FACE = 6  # points of a plane, where they are exact,
+WIDE = 0.05  # unless their second variance is a smaller share of the first: points of a line lie in any plane
 ASKED = 8  # planes a query hears, of the point nearest to it and of that point's neighbours,
 ASKED_OF_EXACT = 4  # fewer where noise need not be averaged away
 MOST = 16_384  # points that are kept
@@ -126,7 +127,7 @@ def seen_surface(
     center, normal, spread = fitted(points, neighbours)
     roughness = float(np.sqrt(max(0.0, np.median(spread[:, 0]))))
     if exact := roughness < EXACT * float(np.sqrt(np.median(spread.sum(axis=1)))):
-        center, normal = points, facing(points, neighbours)
+        center, normal = points, facing(points, neighbours, normal)
     around = slope[neighbours].sum(axis=1)
     rise = np.einsum("ni,ni->n", normal, around) / np.maximum(np.linalg.norm(around, axis=1), 1e-9)
     gap = GAP * max(float(np.median(apart[:, 1])), LEAST_GAP)
@@ -145,12 +146,15 @@ def fitted(points: Points, near: Int[np.ndarray, "n k"]) -> tuple[Points, Points
     return center, axes[:, :, 0], spread
 
 
-def facing(points: Points, near: Int[np.ndarray, "n k"]) -> Points:
+def facing(points: Points, near: Int[np.ndarray, "n k"], otherwise: Points) -> Points:
     """Normals (of either sign) of exact points: of the plane around that its own points and this one lie best in.
 
     So a point beside an edge has its face's normal, not the mean of two; of a thin leg's narrow sides likewise.
+    `otherwise` where all points around lie in lines, as along a scanner's.
     """
     center, normal, spread = fitted(points, near[:, :OF_FACE])
     off = np.einsum("nki,nki->nk", normal[near], points[:, None] - center[near])
-    best = (spread[near, 0] + off**2).argmin(axis=1)
-    return normal[near[np.arange(len(points)), best]]
+    is_plane = (spread[:, 1] > WIDE * spread[:, 2])[near]
+    best = np.where(is_plane, spread[near, 0] + off**2, np.inf).argmin(axis=1)
+    own = normal[near[np.arange(len(points)), best]]
+    return np.where(is_plane.any(axis=1)[:, None], own, otherwise)

@@ -211,6 +211,19 @@ def test_exact_points_beside_an_edge_face_as_their_side_does():
     assert np.mean(faces > 0.99) > 0.97 > 0.9 > np.mean(np.abs(np.einsum("ni,ni->n", plain, outward)) > 0.99)
 
 
+def test_along_scan_lines_neighbours_of_one_line_make_no_plane():
+    """Points four times as dense along lines as across: the six nearest are of one line, not the twelve nearest."""
+    along, across = np.meshgrid(np.arange(-0.3, 0.3, 0.001), np.arange(-0.05, 0.05, 0.004))
+    points = np.column_stack([along.ravel(), across.ravel(), np.zeros(along.size)])
+    points = np.concatenate([points, points[:, [0, 2, 1]] + [0, 0.1, 0.1]])  # floor and wall
+    outward = np.repeat([[0.0, 0, 1], [0, -1, 0]], along.size, axis=0)
+    found = seen_surface(points, outward, REACH)
+    assert found.exact
+    faces = np.einsum("ni,ni->n", found.normal, outward)
+    nearest = np.abs(np.einsum("ni,ni->n", fitted(points, found.neighbours[:, :6])[1], outward))
+    assert np.mean(faces > 0.99) > 0.9 > 0.7 > np.mean(nearest > 0.99)
+
+
 def test_of_noisy_points_planes_stay_means():
     points, _ = leg(noise=0.003)
     found = seen_surface(points, points * [1, 1, 0], REACH)
