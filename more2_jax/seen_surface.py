@@ -154,7 +154,7 @@ def facing(points: Points, near: Int[np.ndarray, "n k"], otherwise: Points) -> P
     """
     center, normal, spread = fitted(points, near[:, :OF_FACE])
     off = np.einsum("nki,nki->nk", normal[near], points[:, None] - center[near])
-    is_plane = np.greater(spread[:, 1], WIDE * spread[:, 2])[near]
+    is_plane = spread[near, 1] > WIDE * spread[near, 2]
     best = np.where(is_plane, spread[near, 0] + off**2, np.inf).argmin(axis=1)
     own = normal[near[np.arange(len(points)), best]]
-    return np.where(is_plane.any(axis=1)[:, None], own, otherwise)
+    return np.where(np.any(is_plane, axis=1, keepdims=True), own, otherwise)
