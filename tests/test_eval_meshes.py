@@ -59,7 +59,6 @@ def test_a_distance_is_to_the_surface_however_few_its_samples_are(off):
     found = mesh_scores(mesh_of(wider), TRUTH, np.eye(4), SAMPLES)
     assert found["completeness_m"] == pytest.approx(off, rel=1e-6)
     assert off <= found["accuracy_m"] < 1.1 * off  # a little more beyond the edges
-    assert found["chamfer.paper"] > 0.9 * off
 
 
 def test_no_mesh_recalls_nothing_and_has_no_distance():
