@@ -150,6 +150,16 @@ class MeshingConfig:
 
 
 @dataclass(frozen=True)
+class ClosingConfig:
+    """All observations of an object laid onto one another at once, before its mesh is made; canonical units."""
+
+    steps: int = 0  # of all poses together; 0: they stay as registered
+    points: int = 1024  # of every observation
+    first_reach: float = 0.05  # off the surface; farther apart counts less than a quarter
+    last_reach: float = 0.001
+
+
+@dataclass(frozen=True)
 class SceneConfig:
     """The whole method; `preset('paper')` is METHOD to the letter, `preset('robust')` the default."""
 
@@ -164,6 +174,7 @@ class SceneConfig:
     accumulate_misfit: float = 1.0  # an observation whose registration fits worse is left out of the shape
     matching: MatchingConfig = field(default_factory=MatchingConfig)
     registration: RegistrationConfig = field(default_factory=RegistrationConfig)
+    closing: ClosingConfig = field(default_factory=ClosingConfig)
     joint: JointConfig = field(default_factory=JointConfig)
     meshing: MeshingConfig = field(default_factory=MeshingConfig)
 
@@ -258,6 +269,7 @@ def preset(name: str, *, upright: bool = False) -> SceneConfig:
                 free_weight=1.0 if upright else 0.0,
             ),
             meshing=ROBUST_MESHING,
+            closing=ClosingConfig(steps=16),
             # No step: after alignment by surfaces it buys neither poses nor meshes (docs/design_notes.md).
             joint=JointConfig(points=128, start="accumulated", steps=0, eqv_learning_rate=1e-3),
         )

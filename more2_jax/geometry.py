@@ -93,11 +93,10 @@ def nearest(
 
 
 def nearest_index(
-    a: Float[Array, "n 3"], b: Float[Array, "m 3"], b_mask: Bool[Array, " m"]
+    a: Float[Array, "n d"], b: Float[Array, "m d"], b_mask: Bool[Array, " m"]
 ) -> Int[Array, " n"]:
     """Index of the nearest real row of `b` for every row of `a`; ties as in `nearest`."""
-    offset = [(a[:, None, i] - b[None, :, i]).astype(jnp.float32) for i in range(3)]
-    squared = offset[0] ** 2 + offset[1] ** 2 + offset[2] ** 2
+    squared = sum((a[:, None, i] - b[None, :, i]).astype(jnp.float32) ** 2 for i in range(a.shape[1]))
     # The bits of floats ≥ 0 are ordered as the floats are. With the column number in the lowest bits one plain
     # minimum gives value and place: a third of the time of argmin on a CPU.
     low = (1 << max(len(b) - 1, 1).bit_length()) - 1

@@ -38,7 +38,7 @@ from more2_jax.types import (
 )
 
 VERSION = 1
-STAGES = ("encode", "match", "register", "joint", "mesh")
+STAGES = ("encode", "match", "register", "close", "joint", "mesh")
 WRITTEN = (
     "scene.json",
     "objects",

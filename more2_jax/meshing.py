@@ -58,7 +58,7 @@ def extract_mesh(
     """
     _check(config)
     half = half_width or config.half_width
-    lowest = -np.inf if floor is None else canonical(embedding, np.array([[0.0, 0.0, floor]]))[0, 2]
+    lowest = lowest_height(embedding, floor)
     through = surface_through(prior, embedding, seen, config, lowest, seen_from)
     ask = partial(_field, prior, embedding, level)
     draw = partial(_drawn, through, lowest)
@@ -109,6 +109,11 @@ def observed_level(prior: Prior, embedding: Embedding, points: Float[np.ndarray,
 def canonical(embedding: Embedding, points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
     """Points of the scan's frame in canonical units, relative to the object's centre."""
     return (points - np.asarray(embedding.center, np.float64) - embedding.origin) / float(embedding.scale)
+
+
+def lowest_height(embedding: Embedding, floor: float | None) -> float:
+    """A floor's height (metres, the scan's frame) in canonical units, relative to the centre; −∞ if there is none."""
+    return -np.inf if floor is None else float(canonical(embedding, np.array([[0.0, 0.0, floor]]))[0, 2])
 
 
 def _field(

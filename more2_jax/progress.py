@@ -14,7 +14,7 @@ class Progress:
     """One stage began, came further, or ended."""
 
     event: Literal["started", "advanced", "finished"]
-    stage: str  # encode, match, register, joint, mesh
+    stage: str  # encode, match, register, close, joint, mesh
     scan: str | None  # name of the scan being added; None where the whole scene is worked on
     done: int
     total: int

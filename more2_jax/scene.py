@@ -11,6 +11,7 @@ from functools import partial
 import numpy as np
 from jaxtyping import Float
 
+from more2_jax.closing import close_objects
 from more2_jax.config import SceneConfig
 from more2_jax.encoding import embed
 from more2_jax.fitting import embed_accumulated, fit_objects
@@ -108,16 +109,21 @@ def add_scan(
 def reconstruct(
     prior: Prior, scene: LivingScene, config: SceneConfig, *, progress: Watcher | None = None
 ) -> LivingScene:
-    """Optimises code and poses of every object seen more than once, all in one call, then extracts meshes.
+    """Poses of objects seen more than once are made to agree, or optimised with the code; then meshes are extracted.
 
-    With no `joint.steps`, as in `robust`, meshes alone. Observations in doubt (`Observation.accumulated` False) have
+    `closing.steps` (`robust`): all observations of an object are laid onto one another at once. `joint.steps`
+    (`paper`): code and poses of all objects are optimised in one call. Observations in doubt (`Observation.accumulated` False) have
     no part in it. Objects that have a mesh have not changed since and are left alone.
     """
     timing, objects = dict(scene.timing_s), list(scene.objects)
     todo = [k for k, o in enumerate(objects) if o.mesh is None]
-    again = [k for k in todo if config.joint.steps and len(accumulated(objects[k])) > 1]
-    with staged(timing, progress, "joint", len(again)):
-        objects = fit_objects(prior, objects, again, config)
+    again = [k for k in todo if seen_often(objects[k])]
+    close, fit = again if config.closing.steps else [], again if config.joint.steps else []
+    with staged(timing, progress, "close", len(close)):
+        floors = [floor_under(o, scene.scans[o.reference_scan].background, config) for o in objects]
+        objects = close_objects(prior, objects, close, scene.scans, floors, config)
+    with staged(timing, progress, "joint", len(fit)):
+        objects = fit_objects(prior, objects, fit, config)
     with staged(timing, progress, "mesh", len(todo)) as advance:
         meshes = meshes_of(prior, [objects[k] for k in todo], scene.scans, config)
         for done, (k, mesh) in enumerate(zip(todo, meshes, strict=True), start=1):

@@ -14,7 +14,7 @@ from more2_jax.types import (
 )
 
 WORLD_M = np.array([1000.0, -2000.0, 5.0])
-STAGES = {"encode": 1.5, "match": 0.25, "register": 3.0, "joint": 2.0, "mesh": 0.5}
+STAGES = {"encode": 1.5, "match": 0.25, "register": 3.0, "close": 0.5, "joint": 2.0, "mesh": 0.5}
 
 
 def turn_z(angle: float, center: np.ndarray, shift: np.ndarray) -> np.ndarray:

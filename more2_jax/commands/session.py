@@ -33,6 +33,7 @@ DOING = {
     "encode": "encoding",
     "match": "matching",
     "register": "registering",
+    "close": "fitting observations together",
     "joint": "optimising jointly",
     "mesh": "meshing",
 }

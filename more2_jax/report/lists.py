@@ -15,6 +15,7 @@ STAGES = {
     "encode": "Describing each object",
     "match": "Finding it again",
     "register": "Finding how it moved",
+    "close": "Fitting all scans of it together",
     "joint": "Refining shape and pose",
     "mesh": "Reconstructing surfaces",
 }

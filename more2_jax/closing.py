@@ -1,0 +1,108 @@
+"""Every object's observations laid onto one another at once, before its mesh is made: records to batches, and back."""
+
+from __future__ import annotations
+
+import os
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from more2_jax.batching import bucket
+from more2_jax.config import SceneConfig
+from more2_jax.fitting import embed_accumulated, repose
+from more2_jax.meshing import lowest_height, surface_through
+from more2_jax.objects import Pose, accumulated, accumulated_points
+from more2_jax.outliers import inliers
+from more2_jax.pose_graph import Sides, close_poses
+from more2_jax.prior import Prior
+from more2_jax.seen_surface import SeenSurface, some_of
+from more2_jax.sights import seen_from
+from more2_jax.types import ScanRecord, SceneObject
+
+MOST_SEEN = 8192  # points of an observation that planes are laid through
+MOST_OBSERVATIONS = 32  # of an object: its first, and the last of the others; more stay as registered
+
+
+def close_objects(
+    prior: Prior,
+    objects: Sequence[SceneObject],
+    chosen: Sequence[int],
+    scans: Sequence[ScanRecord],
+    floors: Sequence[float | None],
+    config: SceneConfig,
+) -> list[SceneObject]:
+    """The `chosen` objects with poses of their observations that agree with one another, the first held.
+
+    `floors`: the height of each object's floor in its frame, metres, if known. What was seen has no sides where
+    meshes are not drawn to it (`meshing.seen_reach` 0); then all stays as it is. Where codes are of all that was
+    accumulated, they are made anew.
+    """
+    result = list(objects)
+    with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
+        sides = list(
+            pool.map(lambda k: list(sides_seen(prior, objects[k], scans, floors[k], config)), chosen)
+        )
+    alike: dict[int, list[int]] = defaultdict(list)  # by the number of observations, padded
+    for n, seen in enumerate(sides):
+        alike[bucket(len(seen), 2)].append(n)
+    for most, rows in alike.items():
+        batch = gather([sides[n] for n in rows], most, config.closing.points)
+        moved = jax.device_get(close_poses(batch, config.closing, config.upright))
+        for n, moves in zip(rows, moved, strict=False):  # without the batch's filling
+            result[chosen[n]] = moved_by(objects[chosen[n]], moves)
+    return embed_accumulated(prior, result, chosen) if config.accumulate_target else result
+
+
+def few(o: SceneObject) -> list[int]:
+    """Which of an object's accumulated observations are laid onto one another, its reference first."""
+    count = len(accumulated(o))
+    return [0, *range(max(1, count - MOST_OBSERVATIONS + 1), count)]
+
+
+def sides_seen(
+    prior: Prior, o: SceneObject, scans: Sequence[ScanRecord], floor: float | None, config: SceneConfig
+) -> Iterator[SeenSurface | None]:
+    """What each of these observations saw, as planes with an outside, by its own points alone."""
+    points, eyes, seen = accumulated_points(o), seen_from(o, scans), accumulated(o)
+    scan = o.point_scan[np.isin(o.point_scan, [s.scan for s in seen])]
+    for k in few(o):
+        own = np.flatnonzero(scan == seen[k].scan)
+        own = some_of(own, MOST_SEEN)
+        own = own[inliers(points[own], config.meshing.outlier_factor)]
+        there = None if eyes is None else eyes[own]
+        lowest = lowest_height(o.embedding, floor)
+        yield surface_through(prior, o.embedding, points[own], config.meshing, lowest, there)
+
+
+def gather(rows: Sequence[Sequence[SeenSurface | None]], most: int, size: int) -> Sides:
+    """Observations of several objects as one batch: `size` points each, `most` of an object."""
+    count = bucket(len(rows))
+    points, normals = np.zeros((2, count, most, size, 3), np.float32)
+    mask = np.zeros((count, most, size), bool)
+    for n, row in enumerate(rows):
+        for j, seen in enumerate(row):
+            if seen is not None:
+                kept = some_of(np.arange(len(seen.points)), size)
+                points[n, j, : len(kept)], normals[n, j, : len(kept)] = seen.points[kept], seen.normal[kept]
+                mask[n, j, : len(kept)] = True
+    return Sides(points=jnp.asarray(points), normals=jnp.asarray(normals), mask=jnp.asarray(mask))
+
+
+def moved_by(o: SceneObject, moves: np.ndarray) -> SceneObject:
+    """The object with its observations moved, in canonical units about its centre; its cloud follows.
+
+    A move that is not finite is none.
+    """
+    scale = float(o.embedding.scale)
+    center = np.asarray(o.embedding.center, np.float64) + o.embedding.origin
+    poses: list[Pose] = [seen.T_ref_scan for seen in accumulated(o)]
+    for j, k in enumerate(few(o)):
+        T = np.asarray(moves[j], np.float64)
+        if j and np.isfinite(T).all():
+            T[:3, 3] = scale * T[:3, 3] + center - T[:3, :3] @ center
+            poses[k] = T @ poses[k]
+    return repose(o, poses)

@@ -1,0 +1,131 @@
+"""All observations of one object laid onto one another at once: its pose graph, closed over every pair.
+
+Beyond the paper. A scan is registered onto what was seen before it, one after the other, and every slip stays. Here
+all poses move together: an observation's points are compared with those of all others, point to plane, and one
+Gauss-Newton step a round solves for every pose. Only sides that face alike are compared, so the two faces of a board,
+each seen from its own side, do not pull each other together.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import jaxlie
+from jax import Array
+from jaxtyping import Bool, Float
+
+from more2_jax.alignment import ALONG, DAMPING, free_directions, moments, sliding, spacing
+from more2_jax.config import ClosingConfig
+from more2_jax.geometry import nearest_index
+from more2_jax.in_turn import in_turn
+from more2_jax.types import pytree
+
+FACING = 0.1  # what turning a normal by 1 (its length) counts, beside canonical units of way, in what is nearest
+
+
+@pytree
+class Sides:
+    """What observations saw of one object: points and outward normals in its frame, canonical units."""
+
+    points: Float[Array, "*b k n 3"]
+    normals: Float[Array, "*b k n 3"]
+    mask: Bool[Array, "*b k n"]
+
+
+@partial(jax.jit, static_argnums=(1, 2))
+def close_poses(sides: Sides, config: ClosingConfig, upright: bool) -> Float[Array, "b k 4 4"]:
+    """`closed` of a batch of objects, as matrices."""
+
+    def one(_: None, sides: Sides) -> Array:
+        return closed(sides, config, upright).as_matrix()
+
+    return in_turn(one, None, sides, 1)
+
+
+def closed(sides: Sides, config: ClosingConfig, upright: bool) -> jaxlie.SE3:
+    """By what every observation (k) moves so that all fit; the first stays where it is. One object, vmap outside.
+
+    `upright`: shifts, and turns about the vertical, only. An observation without points stays, too.
+    """
+    count = len(sides.points)
+    start = jaxlie.SE3.identity(batch_axes=(count,))
+    apart = jax.vmap(spacing)(sides.points, sides.mask)
+    reaches = jnp.geomspace(config.first_reach, config.last_reach, config.steps)
+
+    def body(T: jaxlie.SE3, reach: Array) -> tuple[jaxlie.SE3, None]:
+        return close_step(T, sides, apart, reach, upright), None
+
+    return jax.lax.scan(body, start, reaches)[0]
+
+
+def close_step(
+    T: jaxlie.SE3, sides: Sides, apart: Float[Array, " k"], reach: Float[Array, ""], upright: bool
+) -> jaxlie.SE3:
+    """One Gauss-Newton step of all poses but the first."""
+    count = len(apart)
+    R = T.rotation().as_matrix()
+    points = jnp.einsum("knj,kij->kni", sides.points, R, precision="highest") + T.translation()[:, None]
+    placed = Sides(points=points, normals=jnp.einsum("knj,kij->kni", sides.normals, R), mask=sides.mask)
+
+    def of(k: Array) -> tuple[Array, Array]:
+        none = jnp.zeros((count, 6, 6)), jnp.zeros((count, 6))
+        return jax.lax.cond(
+            placed.mask[k].any(), lambda: pair_equations(placed, k, apart, reach), lambda: none
+        )
+
+    matrix, vector = jax.lax.map(of, jnp.arange(count))  # one at a time: of all together, all distances are held
+    both = matrix + matrix.swapaxes(0, 1)  # what k sees of l moves both
+    H = jnp.diag(jnp.ones(count))[:, :, None, None] * both.sum(axis=1)[:, None] - both
+    right = (vector.sum(axis=1) - vector.sum(axis=0))[1:].reshape(-1)
+    H = H[1:, 1:].swapaxes(1, 2).reshape(len(right), len(right))
+    free = jnp.tile(free_directions(upright), count - 1)
+    H = (H + (DAMPING * jnp.trace(H) / len(right) + 1e-9) * jnp.eye(len(right))) * free * free[:, None]
+    step = solved(H + jnp.diag(1 - free), right * free).reshape(-1, 6)
+    return jaxlie.SE3.exp(jnp.concatenate([jnp.zeros((1, 6)), step])) @ T
+
+
+def pair_equations(
+    placed: Sides, k: Array, apart: Float[Array, " k"], reach: Float[Array, ""]
+) -> tuple[Float[Array, "k 6 6"], Float[Array, "k 6"]]:
+    """Normal equations of observation `k`'s points against the nearest of the others', by whose those are.
+
+    A correspondence off its plane by `reach`, or along it by that and the spacing of points, counts a quarter.
+    """
+    points, normals, mask = placed.points, placed.normals, placed.mask
+    count, size, _ = points.shape
+    everywhere = jnp.concatenate([points, FACING * normals], axis=-1)
+    others = mask & (jnp.arange(count) != k)[:, None]
+    there = nearest_index(everywhere[k], everywhere.reshape(-1, 6), others.reshape(-1))
+    own, gap = points[k], points.reshape(-1, 3)[there] - points[k]
+    other = normals.reshape(-1, 3)[there]
+    agree = jnp.sum(normals[k] * other, axis=-1)
+    normal = normals[k] + other
+    normal = normal / jnp.sqrt(jnp.maximum(jnp.sum(normal**2, axis=-1, keepdims=True), 1e-12))
+    off = jnp.sum(normal * gap, axis=-1)
+    along = jnp.maximum(jnp.sum(gap**2, axis=-1) - off**2, 0.0)
+    whose = there // size
+    wide = reach**2 + jnp.maximum(apart[k], apart[whose]) ** 2
+    weight = (reach**2 / (reach**2 + off**2) * wide / (wide + along) * jnp.maximum(agree, 0.0) ** 2) ** 2
+    weight = jnp.where(mask[k] & others.reshape(-1)[there], weight, 0.0)
+    leaving = jnp.concatenate([normal, jnp.cross(own, normal), off[:, None]], axis=1).T
+    slid = jnp.concatenate([own, gap, jnp.ones_like(off)[:, None]], axis=1).T
+
+    def onto(l: Array) -> tuple[Array, Array]:
+        w = jnp.where(whose == l, weight, 0.0)
+        m, (matrix, vector) = moments(leaving, w), sliding(moments(slid, w))
+        return (1 - ALONG) * m[:6, :6] + ALONG * matrix, (1 - ALONG) * m[:6, 6] + ALONG * vector
+
+    return jax.vmap(onto)(jnp.arange(count))
+
+
+def solved(matrix: Float[Array, "n n"], right: Float[Array, " n"]) -> Float[Array, " n"]:
+    """`matrix⁻¹ right` of a positive definite matrix, by elimination without pivots (as `alignment.solve_spd`)."""
+    rows = jnp.concatenate([matrix, right[:, None]], axis=1)
+
+    def eliminate(k: int, rows: Array) -> Array:
+        row = rows[k] / rows[k, k]
+        return (rows - rows[:, k, None] * row).at[k].set(row)
+
+    return jax.lax.fori_loop(0, len(right), eliminate, rows)[:, -1]
