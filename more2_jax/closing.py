@@ -89,7 +89,11 @@ def gather(rows: Sequence[Sequence[SeenSurface | None]], most: int, size: int) -
                 kept = some_of(np.arange(len(seen.points)), size)
                 points[n, j, : len(kept)], normals[n, j, : len(kept)] = seen.points[kept], seen.normal[kept]
                 mask[n, j, : len(kept)] = True
-    return Sides(points=jnp.asarray(points), normals=jnp.asarray(normals), mask=jnp.asarray(mask))
+    roughness = np.zeros(count, np.float32)
+    for n, row in enumerate(rows):
+        roughness[n] = np.median([seen.roughness for seen in row if seen is not None] or [0.0])
+    whole = Sides(points=points, normals=normals, mask=mask, roughness=roughness)  # type: ignore[arg-type]
+    return jax.tree.map(jnp.asarray, whole)
 
 
 def moved_by(o: SceneObject, moves: np.ndarray) -> SceneObject:

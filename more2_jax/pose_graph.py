@@ -8,6 +8,7 @@ each seen from its own side, do not pull each other together.
 
 from __future__ import annotations
 
+import dataclasses
 from functools import partial
 
 import jax
@@ -25,6 +26,10 @@ from more2_jax.types import pytree
 FACING = 0.1  # what turning a normal by 1 (its length) counts, beside canonical units of way, in what is nearest
 
 
+NOISE = 4.0  # times the roughness of points: the least reach
+FARTHEST = 4.0  # reaches off a plane, from where on nothing counts: what is far off must not pull, however much it is
+
+
 @pytree
 class Sides:
     """What observations saw of one object: points and outward normals in its frame, canonical units."""
@@ -32,6 +37,7 @@ class Sides:
     points: Float[Array, "*b k n 3"]
     normals: Float[Array, "*b k n 3"]
     mask: Bool[Array, "*b k n"]
+    roughness: Float[Array, "*b"]  # how far off the surface points lie, typically
 
 
 @partial(jax.jit, static_argnums=(1, 2))
@@ -52,7 +58,9 @@ def closed(sides: Sides, config: ClosingConfig, upright: bool) -> jaxlie.SE3:
     count = len(sides.points)
     start = jaxlie.SE3.identity(batch_axes=(count,))
     apart = jax.vmap(spacing)(sides.points, sides.mask)
-    reaches = jnp.geomspace(config.first_reach, config.last_reach, config.steps)
+    # Among noise a short reach hears the few points that happen to agree.
+    last = jnp.clip(NOISE * sides.roughness, config.last_reach, config.first_reach)
+    reaches = jnp.geomspace(config.first_reach, last, config.steps)
 
     def body(T: jaxlie.SE3, reach: Array) -> tuple[jaxlie.SE3, None]:
         return close_step(T, sides, apart, reach, upright), None
@@ -67,7 +75,8 @@ def close_step(
     count = len(apart)
     R = T.rotation().as_matrix()
     points = jnp.einsum("knj,kij->kni", sides.points, R, precision="highest") + T.translation()[:, None]
-    placed = Sides(points=points, normals=jnp.einsum("knj,kij->kni", sides.normals, R), mask=sides.mask)
+    normals = jnp.einsum("knj,kij->kni", sides.normals, R)
+    placed = dataclasses.replace(sides, points=points, normals=normals)
 
     def of(k: Array) -> tuple[Array, Array]:
         none = jnp.zeros((count, 6, 6)), jnp.zeros((count, 6))
@@ -77,11 +86,13 @@ def close_step(
 
     matrix, vector = jax.lax.map(of, jnp.arange(count))  # one at a time: of all together, all distances are held
     both = matrix + matrix.swapaxes(0, 1)  # what k sees of l moves both
-    H = jnp.diag(jnp.ones(count))[:, :, None, None] * both.sum(axis=1)[:, None] - both
+    H = jnp.eye(count)[:, :, None, None] * both.sum(axis=1)[:, None] - both
     right = (vector.sum(axis=1) - vector.sum(axis=0))[1:].reshape(-1)
     H = H[1:, 1:].swapaxes(1, 2).reshape(len(right), len(right))
     free = jnp.tile(free_directions(upright), count - 1)
-    H = (H + (DAMPING * jnp.trace(H) / len(right) + 1e-9) * jnp.eye(len(right))) * free * free[:, None]
+    # Against the number of points, not the sum of weights: where hardly any has a partner, nothing is to move.
+    each = placed.mask.sum() / jnp.maximum(placed.mask.any(axis=1).sum(), 1)
+    H = (H + (DAMPING * each + 1e-9) * jnp.eye(len(right))) * free * free[:, None]
     step = solved(H + jnp.diag(1 - free), right * free).reshape(-1, 6)
     return jaxlie.SE3.exp(jnp.concatenate([jnp.zeros((1, 6)), step])) @ T
 
@@ -108,7 +119,8 @@ def pair_equations(
     whose = there // size
     wide = reach**2 + jnp.maximum(apart[k], apart[whose]) ** 2
     weight = (reach**2 / (reach**2 + off**2) * wide / (wide + along) * jnp.maximum(agree, 0.0) ** 2) ** 2
-    weight = jnp.where(mask[k] & others.reshape(-1)[there], weight, 0.0)
+    near = jnp.abs(off) < FARTHEST * reach
+    weight = jnp.where(near & mask[k] & others.reshape(-1)[there], weight, 0.0)
     leaving = jnp.concatenate([normal, jnp.cross(own, normal), off[:, None]], axis=1).T
     slid = jnp.concatenate([own, gap, jnp.ones_like(off)[:, None]], axis=1).T
 
