@@ -23,7 +23,9 @@ from more2_jax.geometry import nearest_index
 from more2_jax.in_turn import in_turn
 from more2_jax.types import pytree
 
-FACING = 0.1  # what turning a normal by 1 (its length) counts, beside canonical units of way, in what is nearest
+FACING = (
+    0.1  # what turning a normal by 1 (its length) counts, beside canonical units of way, in what is nearest
+)
 
 
 NOISE = 4.0  # times the roughness of points: the least reach
@@ -84,7 +86,9 @@ def close_step(
             placed.mask[k].any(), lambda: pair_equations(placed, k, apart, reach), lambda: none
         )
 
-    matrix, vector = jax.lax.map(of, jnp.arange(count))  # one at a time: of all together, all distances are held
+    matrix, vector = jax.lax.map(
+        of, jnp.arange(count)
+    )  # one at a time: of all together, all distances are held
     both = matrix + matrix.swapaxes(0, 1)  # what k sees of l moves both
     H = jnp.eye(count)[:, :, None, None] * both.sum(axis=1)[:, None] - both
     right = (vector.sum(axis=1) - vector.sum(axis=0))[1:].reshape(-1)
@@ -124,8 +128,8 @@ def pair_equations(
     leaving = jnp.concatenate([normal, jnp.cross(own, normal), off[:, None]], axis=1).T
     slid = jnp.concatenate([own, gap, jnp.ones_like(off)[:, None]], axis=1).T
 
-    def onto(l: Array) -> tuple[Array, Array]:
-        w = jnp.where(whose == l, weight, 0.0)
+    def onto(row: Array) -> tuple[Array, Array]:
+        w = jnp.where(whose == row, weight, 0.0)
         m, (matrix, vector) = moments(leaving, w), sliding(moments(slid, w))
         return (1 - ALONG) * m[:6, :6] + ALONG * matrix, (1 - ALONG) * m[:6, 6] + ALONG * vector
 

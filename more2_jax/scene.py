@@ -112,8 +112,9 @@ def reconstruct(
     """Poses of objects seen more than once are made to agree, or optimised with the code; then meshes are extracted.
 
     `closing.steps` (`robust`): all observations of an object are laid onto one another at once. `joint.steps`
-    (`paper`): code and poses of all objects are optimised in one call. Observations in doubt (`Observation.accumulated` False) have
-    no part in it. Objects that have a mesh have not changed since and are left alone.
+    (`paper`): code and poses of all objects are optimised in one call. Observations in doubt
+    (`Observation.accumulated` False) have no part in it. Objects that have a mesh have not changed since and are left
+    alone.
     """
     timing, objects = dict(scene.timing_s), list(scene.objects)
     todo = [k for k, o in enumerate(objects) if o.mesh is None]

@@ -1,4 +1,4 @@
-"""All observations of an object at once: slips are found, what tells nothing stays, padding and order change nothing."""
+"""All observations of an object at once: slips are found, what tells nothing stays; padding and order."""
 
 import dataclasses
 
@@ -58,7 +58,12 @@ def left(found, moves, views):
     ]
 
 
-AROUND = ([0, 2, 5], [2, 1, 5], [1, 3, 5], [0, 1, 2, 3, 5])  # some two leave a direction open, all together none
+AROUND = (
+    [0, 2, 5],
+    [2, 1, 5],
+    [1, 3, 5],
+    [0, 1, 2, 3, 5],
+)  # some two leave a direction open, all together none
 
 
 @pytest.mark.parametrize("upright", [True, False])

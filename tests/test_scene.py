@@ -199,11 +199,14 @@ def test_several_scans_confirm_one_another_one_does_not(monkeypatch, tiny_prior,
     assert asked == [ROBUST.meshing.outlier_factor_of_many, 0.3, ROBUST.meshing.outlier_factor, 0.0]
 
 
-def test_without_joint_steps_codes_and_poses_stay_and_with_them_they_do_not(tiny_prior, scene):
-    """The preset `robust` has none; `CONFIG` has three."""
-    without = dataclasses.replace(CONFIG, joint=ROBUST.joint)
-    stayed, moved = (reconstruct(tiny_prior, scene, c) for c in (without, CONFIG))
-    assert ROBUST.joint.steps == 0
+@pytest.mark.parametrize("steps", ["joint", "closing"])
+def test_without_steps_codes_and_poses_stay_and_with_them_they_do_not(tiny_prior, scene, steps):
+    """The preset `robust` has none of `joint`, `paper` none of `closing`."""
+    none = {"joint": ROBUST.joint, "closing": preset("paper").closing}
+    without = dataclasses.replace(CONFIG, **none)
+    some = dataclasses.replace(without, **{steps: getattr(CONFIG, steps)})
+    stayed, moved = (reconstruct(tiny_prior, scene, c) for c in (without, some))
+    assert ROBUST.joint.steps == preset("paper").closing.steps == 0
     for before, after, other in zip(scene.objects, stayed.objects, moved.objects, strict=True):
         assert after.embedding is before.embedding and after.observations is before.observations
         assert (other.embedding is not before.embedding) == (len(before.observations) > 1)
