@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import os
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from more2_jax.batching import bucket
 from more2_jax.config import SceneConfig
@@ -32,14 +33,14 @@ def close_objects(
     objects: Sequence[SceneObject],
     chosen: Sequence[int],
     scans: Sequence[ScanRecord],
-    floors: Sequence[float | None],
+    floors: Mapping[int, float | None],
     config: SceneConfig,
 ) -> list[SceneObject]:
     """The `chosen` objects with poses of their observations that agree with one another, the first held.
 
-    `floors`: the height of each object's floor in its frame, metres, if known. What was seen has no sides where
-    meshes are not drawn to it (`meshing.seen_reach` 0); then all stays as it is. Where codes are of all that was
-    accumulated, they are made anew.
+    `floors`: the height of each chosen object's floor in its frame, metres, None where it is not known. What was seen
+    has no sides where meshes are not drawn to it (`meshing.seen_reach` 0); then all stays as it is. Where codes are of
+    all that was accumulated, they are made anew.
     """
     result = list(objects)
     with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
@@ -107,6 +108,9 @@ def moved_by(o: SceneObject, moves: np.ndarray) -> SceneObject:
     for j, k in enumerate(few(o)):
         T = np.asarray(moves[j], np.float64)
         if j and np.isfinite(T).all():
+            T[:3, :3] = Rotation.from_matrix(
+                T[:3, :3]
+            ).as_matrix()  # to the last bit, however often it is done
             T[:3, 3] = scale * T[:3, 3] + center - T[:3, :3] @ center
             poses[k] = T @ poses[k]
     return repose(o, poses)

@@ -23,11 +23,7 @@ from more2_jax.geometry import nearest_index
 from more2_jax.in_turn import in_turn
 from more2_jax.types import pytree
 
-FACING = (
-    0.1  # what turning a normal by 1 (its length) counts, beside canonical units of way, in what is nearest
-)
-
-
+FACING = 0.1  # canonical units that a normal's change by its length counts for in what is nearest
 NOISE = 4.0  # times the roughness of points: the least reach
 FARTHEST = 4.0  # reaches off a plane, from where on nothing counts: what is far off must not pull, however much it is
 
@@ -77,7 +73,7 @@ def close_step(
     count = len(apart)
     R = T.rotation().as_matrix()
     points = jnp.einsum("knj,kij->kni", sides.points, R, precision="highest") + T.translation()[:, None]
-    normals = jnp.einsum("knj,kij->kni", sides.normals, R)
+    normals = jnp.einsum("knj,kij->kni", sides.normals, R, precision="highest")
     placed = dataclasses.replace(sides, points=points, normals=normals)
 
     def of(k: Array) -> tuple[Array, Array]:
@@ -86,9 +82,8 @@ def close_step(
             placed.mask[k].any(), lambda: pair_equations(placed, k, apart, reach), lambda: none
         )
 
-    matrix, vector = jax.lax.map(
-        of, jnp.arange(count)
-    )  # one at a time: of all together, all distances are held
+    # One at a time: the distances of all together would be held at once.
+    matrix, vector = jax.lax.map(of, jnp.arange(count))
     both = matrix + matrix.swapaxes(0, 1)  # what k sees of l moves both
     H = jnp.eye(count)[:, :, None, None] * both.sum(axis=1)[:, None] - both
     right = (vector.sum(axis=1) - vector.sum(axis=0))[1:].reshape(-1)

@@ -121,7 +121,7 @@ def reconstruct(
     again = [k for k in todo if seen_often(objects[k])]
     close, fit = again if config.closing.steps else [], again if config.joint.steps else []
     with staged(timing, progress, "close", len(close)):
-        floors = [floor_under(o, scene.scans[o.reference_scan].background, config) for o in objects]
+        floors = {k: floor_of(objects[k], scene.scans, config) for k in close}
         objects = close_objects(prior, objects, close, scene.scans, floors, config)
     with staged(timing, progress, "joint", len(fit)):
         objects = fit_objects(prior, objects, fit, config)
@@ -149,6 +149,11 @@ def floor_under(o: SceneObject, background: Float[np.ndarray, "b 3"], config: Sc
     return floor
 
 
+def floor_of(o: SceneObject, scans: Sequence[ScanRecord], config: SceneConfig) -> float | None:
+    """`floor_under` an object in its reference scan."""
+    return floor_under(o, scans[o.reference_scan].background, config)
+
+
 def meshes_of(
     prior: Prior, objects: Sequence[SceneObject], scans: Sequence[ScanRecord], config: SceneConfig
 ) -> Iterator[Mesh | None]:
@@ -164,7 +169,7 @@ def mesh_of(prior: Prior, o: SceneObject, scans: Sequence[ScanRecord], config: S
     """
     points, eyes = trusted(o, scans, config)
     level = observed_level(prior, o.embedding, points) if config.meshing.level == "observed" else 0.0
-    floor = floor_under(o, scans[o.reference_scan].background, config)
+    floor = floor_of(o, scans, config)
     half, meshing = box_half_width(o, config), config.meshing
     if not seen_often(o):
         meshing = dataclasses.replace(meshing, screening_of_many=0.0)

@@ -57,7 +57,7 @@ def off(o, true):
 
 def test_slips_shrink_to_a_fiftieth_and_records_agree(prior):
     o, true = seen_with_slips(prior)
-    (new,) = close_objects(prior, [o], [0], records(3), [0.0], CONFIG)
+    (new,) = close_objects(prior, [o], [0], records(3), {0: 0.0}, CONFIG)
     assert off(o, true) > 0.004
     assert off(new, true) < 0.02 * off(o, true)
     np.testing.assert_array_equal(new.observations[0].T_ref_scan, o.observations[0].T_ref_scan)
@@ -82,7 +82,7 @@ def test_any_orientation_far_from_zero(prior):
         pose = dataclasses.replace(seen, T_ref_scan=there @ seen.T_ref_scan)
         moved = seen_again(moved, Instance(id=1, points=points_of(o, seen)), pose)
     config = preset("robust")
-    (new,) = close_objects(prior, [moved], [0], records(3), [None], config)
+    (new,) = close_objects(prior, [moved], [0], records(3), {0: None}, config)
     found = dataclasses.replace(new, points=apply(back, new.points))
     assert off(found, true) < 0.02 * off(o, true)
 
@@ -91,22 +91,22 @@ def test_what_is_doubted_not_chosen_or_has_no_sides_stays(prior):
     o, _ = seen_with_slips(prior)
     doubted = dataclasses.replace(o.observations[1], accumulated=False)
     doubts = dataclasses.replace(o, observations=(o.observations[0], doubted, o.observations[2]))
-    one, other = close_objects(prior, [doubts, o], [0], records(3), [None, None], CONFIG)
+    one, other = close_objects(prior, [doubts, o], [0], records(3), {0: None}, CONFIG)
     assert other is o
     np.testing.assert_array_equal(one.observations[1].T_ref_scan, doubted.T_ref_scan)
     np.testing.assert_array_equal(one.points[one.point_scan == 1], o.points[o.point_scan == 1])
     assert not np.array_equal(one.observations[2].T_ref_scan, o.observations[2].T_ref_scan)
     plain = dataclasses.replace(CONFIG, meshing=dataclasses.replace(CONFIG.meshing, seen_reach=0.0))
-    (same,) = close_objects(prior, [o], [0], records(3), [None], plain)
+    (same,) = close_objects(prior, [o], [0], records(3), {0: None}, plain)
     np.testing.assert_allclose(same.points, o.points, atol=1e-6)
 
 
 def test_objects_of_different_numbers_of_scans_are_each_closed_as_alone(prior):
     objects = [seen_with_slips(prior, count)[0] for count in (2, 3, 2)]
     scans = records(3)
-    together = close_objects(prior, objects, [0, 1, 2], scans, [None] * 3, CONFIG)
+    together = close_objects(prior, objects, [0, 1, 2], scans, dict.fromkeys(range(3)), CONFIG)
     for o, new in zip(objects, together, strict=True):
-        (alone,) = close_objects(prior, [o], [0], scans, [None], CONFIG)
+        (alone,) = close_objects(prior, [o], [0], scans, {0: None}, CONFIG)
         np.testing.assert_allclose(new.points, alone.points, atol=1e-5)
 
 
@@ -114,7 +114,7 @@ def test_of_many_observations_the_first_and_the_last_are_closed(prior, monkeypat
     monkeypatch.setattr(more2_jax.closing, "MOST_OBSERVATIONS", 3)
     o, _ = seen_with_slips(prior, count=5)
     assert few(o) == [0, 3, 4]
-    (new,) = close_objects(prior, [o], [0], records(5), [None], CONFIG)
+    (new,) = close_objects(prior, [o], [0], records(5), {0: None}, CONFIG)
     moved = [
         not np.array_equal(a.T_ref_scan, b.T_ref_scan)
         for a, b in zip(o.observations, new.observations, strict=True)
