@@ -50,7 +50,7 @@ def test_the_words_are_all_there(opened):
         "% seen",
         "9 points; needed 64",
         "Finding how it moved",
-        "7.2 s",
+        "7.8 s",
     ):
         assert words in text
     item = page.locator("[data-id=object_001]").inner_text()
