@@ -33,7 +33,7 @@ DOING = {
     "encode": "encoding",
     "match": "matching",
     "register": "registering",
-    "close": "fitting observations together",
+    "close": "fitting together",
     "joint": "optimising jointly",
     "mesh": "meshing",
 }
