@@ -23,6 +23,7 @@ from more2_jax.types import pytree
 ALONG = 0.02  # weight of sliding along the surface, against leaving it
 DAMPING = 1e-4  # of the normal equations, in shares of their trace: a ball may turn freely
 NO_TILT = (1.0, 1.0, 1.0, 0.0, 0.0, 1.0)  # shift, and turn about the vertical
+WRITTEN_OUT = 6  # rows of a system: of a pose; what is larger would compile for longer than it runs
 NEIGHBOURHOOD = 2.5  # half width of a normal's neighbourhood, in median distances between neighbours
 
 
@@ -117,13 +118,18 @@ def least_axis(matrix: Float[Array, "*b 3 3"]) -> Float[Array, "*b 3"]:
 
 
 def solve_spd(matrix: Float[Array, "n n"], right: Float[Array, "n m"]) -> Float[Array, "n m"]:
-    """`matrix⁻¹ right` of a small positive definite matrix, by elimination without pivots."""
+    """`matrix⁻¹ right` of a positive definite matrix, by elimination without pivots."""
     rows = jnp.concatenate([matrix, right], axis=1)
     count = len(matrix)
-    for k in range(count):
+
+    def eliminate(k: int | Array, rows: Array) -> Array:
         row = rows[k] / rows[k, k]
-        others = rows - rows[:, k : k + 1] * row
-        rows = others.at[k].set(row)
+        return (rows - rows[:, k, None] * row).at[k].set(row)
+
+    if count > WRITTEN_OUT:
+        return jax.lax.fori_loop(0, count, eliminate, rows)[:, count:]
+    for k in range(count):
+        rows = eliminate(k, rows)
     return rows[:, count:]
 
 

@@ -108,9 +108,8 @@ def moved_by(o: SceneObject, moves: np.ndarray) -> SceneObject:
     for j, k in enumerate(few(o)):
         T = np.asarray(moves[j], np.float64)
         if j and np.isfinite(T).all():
-            T[:3, :3] = Rotation.from_matrix(
-                T[:3, :3]
-            ).as_matrix()  # to the last bit, however often it is done
+            # A rotation to the last bit of float64, however often poses are closed.
+            T[:3, :3] = Rotation.from_matrix(T[:3, :3]).as_matrix()
             T[:3, 3] = scale * T[:3, 3] + center - T[:3, :3] @ center
             poses[k] = T @ poses[k]
     return repose(o, poses)

@@ -17,7 +17,7 @@ import jaxlie
 from jax import Array
 from jaxtyping import Bool, Float
 
-from more2_jax.alignment import ALONG, DAMPING, free_directions, moments, sliding, spacing
+from more2_jax.alignment import ALONG, DAMPING, free_directions, moments, sliding, solve_spd, spacing
 from more2_jax.config import ClosingConfig
 from more2_jax.geometry import nearest_index
 from more2_jax.in_turn import in_turn
@@ -92,7 +92,7 @@ def close_step(
     # Against the number of points, not the sum of weights: where hardly any has a partner, nothing is to move.
     each = placed.mask.sum() / jnp.maximum(placed.mask.any(axis=1).sum(), 1)
     H = (H + (DAMPING * each + 1e-9) * jnp.eye(len(right))) * free * free[:, None]
-    step = solved(H + jnp.diag(1 - free), right * free).reshape(-1, 6)
+    step = solve_spd(H + jnp.diag(1 - free), (right * free)[:, None]).reshape(-1, 6)
     return jaxlie.SE3.exp(jnp.concatenate([jnp.zeros((1, 6)), step])) @ T
 
 
@@ -129,14 +129,3 @@ def pair_equations(
         return (1 - ALONG) * m[:6, :6] + ALONG * matrix, (1 - ALONG) * m[:6, 6] + ALONG * vector
 
     return jax.vmap(onto)(jnp.arange(count))
-
-
-def solved(matrix: Float[Array, "n n"], right: Float[Array, " n"]) -> Float[Array, " n"]:
-    """`matrix⁻¹ right` of a positive definite matrix, by elimination without pivots (as `alignment.solve_spd`)."""
-    rows = jnp.concatenate([matrix, right[:, None]], axis=1)
-
-    def eliminate(k: int, rows: Array) -> Array:
-        row = rows[k] / rows[k, k]
-        return (rows - rows[:, k, None] * row).at[k].set(row)
-
-    return jax.lax.fori_loop(0, len(right), eliminate, rows)[:, -1]

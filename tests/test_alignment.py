@@ -64,10 +64,13 @@ def test_least_axis_is_that_of_numpy():
         assert np.isfinite(axis).all() and np.linalg.norm(axis) == pytest.approx(1, abs=1e-4)
 
 
-def test_elimination_solves_what_numpy_solves():
+@pytest.mark.parametrize(
+    ("size", "least"), [(6, 0.1), (42, 42.0), (186, 186.0)]
+)  # of one pose, and of graphs
+def test_elimination_solves_what_numpy_solves(size, least):
     rng = np.random.default_rng(7)
-    A = rng.normal(size=(6, 6))
-    A, b = A @ A.T + 0.1 * np.eye(6), rng.normal(size=(6, 2))
+    A = rng.normal(size=(size, size))
+    A, b = A @ A.T + least * np.eye(size), rng.normal(size=(size, 2))
     np.testing.assert_allclose(solve_spd(jnp.asarray(A), jnp.asarray(b)), np.linalg.solve(A, b), rtol=2e-3)
 
 

@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from more2_jax.config import ClosingConfig
-from more2_jax.pose_graph import Sides, close_poses, solved
+from more2_jax.pose_graph import Sides, close_poses
 
 CONFIG = ClosingConfig(steps=16, points=512)
 POINTS = 512
@@ -58,12 +58,8 @@ def left(found, moves, views):
     ]
 
 
-AROUND = (
-    [0, 2, 5],
-    [2, 1, 5],
-    [1, 3, 5],
-    [0, 1, 2, 3, 5],
-)  # some two leave a direction open, all together none
+# Some two leave a direction open, all together none.
+AROUND = ([0, 2, 5], [2, 1, 5], [1, 3, 5], [0, 1, 2, 3, 5])
 
 
 @pytest.mark.parametrize("upright", [True, False])
@@ -159,7 +155,8 @@ def test_what_tells_little_stays_finite_and_near(kind):
     }[kind]
     found = np.asarray(close_poses(sides([(flat, up), view]), CONFIG, False))[0]
     assert np.isfinite(found).all()
-    np.testing.assert_allclose(found[1], np.eye(4), atol=0.02)  # half the way between neighbouring points
+    # Points in one place slide to the nearest one: half the way between neighbours at most.
+    np.testing.assert_allclose(found[1], np.eye(4), atol=0.02 if kind == "one place" else 1e-3)
 
 
 def test_as_many_programs_as_numbers_of_observations():
@@ -170,12 +167,3 @@ def test_as_many_programs_as_numbers_of_observations():
             views = [box_view(rng, f) for f in AROUND[:count]]
             close_poses(sides(views, slips(np.random.default_rng(seed), count, upright=True)), CONFIG, True)
     assert close_poses._cache_size() == 2
-
-
-@pytest.mark.parametrize("size", [6, 42, 186])
-def test_elimination_solves_as_numpy_does(size):
-    rng = np.random.default_rng(size)
-    factor = rng.normal(size=(size, size))
-    matrix, right = factor @ factor.T + size * np.eye(size), rng.normal(size=size)
-    got = solved(jnp.asarray(matrix, jnp.float32), jnp.asarray(right, jnp.float32))
-    np.testing.assert_allclose(got, np.linalg.solve(matrix, right), rtol=1e-3, atol=1e-5)
