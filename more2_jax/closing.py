@@ -54,7 +54,7 @@ def close_objects(
         batch = gather([sides[n] for n in rows], most, config.closing.points)
         moved = jax.device_get(close_poses(batch, config.closing, config.upright))
         for n, moves in zip(rows, moved, strict=False):  # without the batch's filling
-            result[chosen[n]] = moved_by(objects[chosen[n]], moves)
+            result[chosen[n]] = moved_by(objects[chosen[n]], moves, config.closing.most_turn_deg)
     return embed_accumulated(prior, result, chosen) if config.accumulate_target else result
 
 
@@ -97,19 +97,21 @@ def gather(rows: Sequence[Sequence[SeenSurface | None]], most: int, size: int) -
     return jax.tree.map(jnp.asarray, whole)
 
 
-def moved_by(o: SceneObject, moves: np.ndarray) -> SceneObject:
+def moved_by(o: SceneObject, moves: np.ndarray, most_turn_deg: float) -> SceneObject:
     """The object with its observations moved, in canonical units about its centre; its cloud follows.
 
-    A move that is not finite is none.
+    A move that is not finite, or turns farther than `most_turn_deg`, is none: poses are made better here, not found.
     """
     scale = float(o.embedding.scale)
     center = np.asarray(o.embedding.center, np.float64) + o.embedding.origin
     poses: list[Pose] = [seen.T_ref_scan for seen in accumulated(o)]
     for j, k in enumerate(few(o)):
         T = np.asarray(moves[j], np.float64)
-        if j and np.isfinite(T).all():
-            # A rotation to the last bit of float64, however often poses are closed.
-            T[:3, :3] = Rotation.from_matrix(T[:3, :3]).as_matrix()
+        if not j or not np.isfinite(T).all():
+            continue
+        turn = Rotation.from_matrix(T[:3, :3])
+        if turn.magnitude() <= np.deg2rad(most_turn_deg):
+            T[:3, :3] = turn.as_matrix()  # to the last bit of float64, however often poses are closed
             T[:3, 3] = scale * T[:3, 3] + center - T[:3, :3] @ center
             poses[k] = T @ poses[k]
     return repose(o, poses)

@@ -11,7 +11,7 @@ from pieces import apply, surface, without_symmetry
 from scipy.spatial.transform import Rotation
 
 import more2_jax.closing
-from more2_jax.closing import close_objects, few, gather
+from more2_jax.closing import close_objects, few, gather, moved_by
 from more2_jax.config import ClosingConfig, preset
 from more2_jax.encoding import embed
 from more2_jax.objects import accumulated_points, new_object, points_of, seen_again
@@ -120,6 +120,29 @@ def test_of_many_observations_the_first_and_the_last_are_closed(prior, monkeypat
         for a, b in zip(o.observations, new.observations, strict=True)
     ]
     assert moved == [False, False, False, True, True]
+
+
+def test_what_would_turn_too_far_has_slipped_and_stays_as_registered(prior):
+    o, _ = seen_with_slips(prior)
+    moves = np.tile(np.eye(4), (3, 1, 1))
+    for k, deg in ((0, 5.0), (1, 2.9), (2, 3.1)):
+        moves[k, :3, :3] = Rotation.from_rotvec([0, 0, np.deg2rad(deg)]).as_matrix()
+    new = moved_by(o, moves, 3.0)
+    for k in (0, 2):
+        np.testing.assert_array_equal(new.observations[k].T_ref_scan, o.observations[k].T_ref_scan)
+        np.testing.assert_allclose(new.points[o.point_scan == k], o.points[o.point_scan == k], atol=1e-12)
+    turned = new.observations[1].T_ref_scan[:3, :3] @ o.observations[1].T_ref_scan[:3, :3].T
+    np.testing.assert_allclose(turned, moves[1, :3, :3], atol=1e-9)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_a_move_that_is_not_finite_is_none(prior, bad):
+    o, _ = seen_with_slips(prior, count=2)
+    moves = np.tile(np.eye(4), (2, 1, 1))
+    moves[1, 0, 3] = bad
+    np.testing.assert_array_equal(
+        moved_by(o, moves, 3.0).observations[1].T_ref_scan, o.observations[1].T_ref_scan
+    )
 
 
 @pytest.mark.parametrize("row", [[None, None], [None]])
