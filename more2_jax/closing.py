@@ -13,7 +13,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from more2_jax.batching import bucket
-from more2_jax.config import SceneConfig
+from more2_jax.config import ClosingConfig, SceneConfig
 from more2_jax.fitting import embed_accumulated, repose
 from more2_jax.meshing import lowest_height, surface_through
 from more2_jax.objects import Pose, accumulated, accumulated_points
@@ -54,7 +54,8 @@ def close_objects(
         batch = gather([sides[n] for n in rows], most, config.closing.points)
         moved = jax.device_get(close_poses(batch, config.closing, config.upright))
         for n, moves in zip(rows, moved, strict=False):  # without the batch's filling
-            result[chosen[n]] = moved_by(objects[chosen[n]], moves, config.closing.most_turn_deg)
+            most = most_turn_deg(sides[n], config.closing)
+            result[chosen[n]] = moved_by(objects[chosen[n]], moves, most)
     return embed_accumulated(prior, result, chosen) if config.accumulate_target else result
 
 
@@ -77,6 +78,12 @@ def sides_seen(
         there = None if eyes is None else eyes[own]
         lowest = lowest_height(o.embedding, floor)
         yield surface_through(prior, o.embedding, points[own], config.meshing, lowest, there)
+
+
+def most_turn_deg(seen: Sequence[SeenSurface | None], config: ClosingConfig) -> float:
+    """By how much an observation of an object may turn: what fits exact points better is right, among noise it may
+    have slipped along."""
+    return np.inf if all(s is None or s.exact for s in seen) else config.most_turn_deg
 
 
 def gather(rows: Sequence[Sequence[SeenSurface | None]], most: int, size: int) -> Sides:

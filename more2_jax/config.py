@@ -157,7 +157,8 @@ class ClosingConfig:
     points: int = 1024  # of every observation
     first_reach: float = 0.05  # off the surface; farther apart counts less than a quarter
     last_reach: float = 0.001
-    most_turn_deg: float = 3.0  # an observation that would turn farther has slipped, and stays as registered
+    # Among noise an observation that would turn farther has slipped, and stays as registered.
+    most_turn_deg: float = 3.0
 
 
 @dataclass(frozen=True)

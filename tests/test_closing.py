@@ -11,7 +11,7 @@ from pieces import apply, surface, without_symmetry
 from scipy.spatial.transform import Rotation
 
 import more2_jax.closing
-from more2_jax.closing import close_objects, few, gather, moved_by
+from more2_jax.closing import close_objects, few, gather, most_turn_deg, moved_by, sides_seen
 from more2_jax.config import ClosingConfig, preset
 from more2_jax.encoding import embed
 from more2_jax.objects import accumulated_points, new_object, points_of, seen_again
@@ -133,6 +133,15 @@ def test_what_would_turn_too_far_has_slipped_and_stays_as_registered(prior):
         np.testing.assert_allclose(new.points[o.point_scan == k], o.points[o.point_scan == k], atol=1e-12)
     turned = new.observations[1].T_ref_scan[:3, :3] @ o.observations[1].T_ref_scan[:3, :3].T
     np.testing.assert_allclose(turned, moves[1, :3, :3], atol=1e-9)
+
+
+def test_only_among_noise_may_what_turns_far_have_slipped(prior):
+    o, _ = seen_with_slips(prior, count=2)
+    (exact, _) = sides = list(sides_seen(prior, o, records(2), None, CONFIG))
+    config = ClosingConfig(most_turn_deg=3.0)
+    assert all(s.exact for s in sides)
+    assert most_turn_deg([*sides, None], config) == np.inf
+    assert most_turn_deg([exact, dataclasses.replace(exact, exact=False)], config) == 3.0
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
