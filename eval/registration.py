@@ -16,6 +16,7 @@ import numpy as np
 import tyro
 
 from eval.batched import PairToRegister, embed_all, register_all
+from eval.closed_pairs import closed_poses
 from eval.figures import Figure, Record, in_columns
 from eval.masks import LOST
 from eval.options import Options, benchmark, is_upright
@@ -25,12 +26,13 @@ from eval.pose_scores import Pose, pose_scores
 from eval.results import finish
 from eval.runs import run_scenes, start_run
 from eval.truth import KnownObject, KnownScene
-from more2_jax.config import RegistrationConfig, preset
+from more2_jax.config import RegistrationConfig, SceneConfig, preset
 from more2_jax.prior import Prior
 from more2_jax.sight import sight_of
-from more2_jax.types import Scan, Sight
+from more2_jax.types import Embedding, Scan, Sight
 from train.program import run
 
+CLOSED = "laid onto one another"
 KABSCH = "Kabsch on F_eqv alone"  # a learned peer, as FreeReg: one look at the codes
 
 
@@ -108,7 +110,8 @@ def main(options: Annotated[Settings, tyro.conf.arg(name="")]) -> None:
 
     def work(scenes: Sequence[KnownScene]) -> list[list[Record]]:
         pairs = [p for s in scenes for p in true_pairs(s, options.pairs)]
-        records = own_records(pairs, current.prior, ours, upright, options.batch) + peer_records(
+        scene = preset(options.preset, upright=upright)
+        records = own_records(pairs, current.prior, ours, upright, options.batch, scene) + peer_records(
             pairs, peers, upright
         )
         return [[r for s, r in records if s == scene.name] for scene in scenes]
@@ -150,8 +153,12 @@ def own_records(
     settings: Mapping[str, RegistrationConfig],
     upright: bool,
     batch: int,
+    closed_by: SceneConfig | None = None,
 ) -> list[tuple[str, Record]]:
-    """The method on all pairs of some scenes; time is that of the batch, shared out."""
+    """The method on all pairs of some scenes; time is that of the batch, shared out.
+
+    The first of the `settings` once more as a scene has it before its meshes are made, if `closed_by` closes poses.
+    """
     if not pairs:
         return []
     clouds = [p.clouds for p in pairs]
@@ -179,7 +186,26 @@ def own_records(
         seconds = encoding_s + (time.perf_counter() - began) / len(pairs)
         seconds += looking_s if config.free_weight else 0.0
         found += [scored(p, T, name, seconds) for p, T in zip(pairs, poses, strict=True)]
+        if closed_by and closed_by.closing.steps and name == next(iter(settings)):
+            found += closed_records(prior, pairs, codes[1::2], poses, closed_by, f"{name}, {CLOSED}", seconds)
     return found
+
+
+def closed_records(
+    prior: Prior,
+    pairs: Sequence[TruePair],
+    codes: Sequence[Embedding],
+    poses: Sequence[Pose],
+    scene: SceneConfig,
+    method: str,
+    seconds: float,
+) -> list[tuple[str, Record]]:
+    """Pairs registered in so many `seconds` each, as a scene has them in the end. `codes` are of the targets."""
+    began = time.perf_counter()
+    scans = [(p.scene.scans[p.scan], p.scene.scans[0]) for p in pairs]
+    closed = closed_poses(prior, [p.clouds for p in pairs], scans, codes, poses, scene)
+    seconds += (time.perf_counter() - began) / len(pairs)
+    return [scored(p, T, method, seconds) for p, T in zip(pairs, closed, strict=True)]
 
 
 def peer_records(
