@@ -81,9 +81,10 @@ def sides_seen(
 
 
 def most_turn_deg(seen: Sequence[SeenSurface | None], config: ClosingConfig) -> float:
-    """By how much an observation of an object may turn: what fits exact points better is right, among noise it may
-    have slipped along."""
-    return np.inf if all(s is None or s.exact for s in seen) else config.most_turn_deg
+    """By how much an observation of an object may turn: among noise it may have slipped, as it may where half of the
+    observations or fewer are exact; what fits exact points better is right."""
+    exact = [s.exact for s in seen if s is not None]
+    return np.inf if 2 * sum(exact) > len(exact) else config.most_turn_deg
 
 
 def gather(rows: Sequence[Sequence[SeenSurface | None]], most: int, size: int) -> Sides:

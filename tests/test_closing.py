@@ -141,7 +141,9 @@ def test_only_among_noise_may_what_turns_far_have_slipped(prior):
     config = ClosingConfig(most_turn_deg=3.0)
     assert all(s.exact for s in sides)
     assert most_turn_deg([*sides, None], config) == np.inf
-    assert most_turn_deg([exact, dataclasses.replace(exact, exact=False)], config) == 3.0
+    rough = dataclasses.replace(exact, exact=False)
+    assert most_turn_deg([exact, rough, exact], config) == np.inf  # most are
+    assert most_turn_deg([exact, rough], config) == most_turn_deg([None], config) == 3.0
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
