@@ -161,6 +161,25 @@ def own_records(
     """
     if not pairs:
         return []
+    ready, encoding_s, looking_s = ready_pairs(pairs, prior, batch)
+    found: list[tuple[str, Record]] = []
+    for name, config in settings.items():
+        began = time.perf_counter()
+        poses = register_all(prior, ready, config, upright, batch)
+        seconds = encoding_s + (time.perf_counter() - began) / len(pairs)
+        seconds += looking_s if config.free_weight else 0.0
+        found += [scored(p, T, name, seconds) for p, T in zip(pairs, poses, strict=True)]
+        if closed_by and closed_by.closing.steps and name == next(iter(settings)):
+            found += closed_records(
+                prior, pairs, [p.target_code for p in ready], poses, closed_by, f"{name}, {CLOSED}", seconds
+            )
+    return found
+
+
+def ready_pairs(
+    pairs: Sequence[TruePair], prior: Prior, batch: int
+) -> tuple[list[PairToRegister], float, float]:
+    """The pairs with their codes and sights, and the seconds that each of the two took a pair."""
     clouds = [p.clouds for p in pairs]
     began = time.perf_counter()
     codes = embed_all(prior, [c for pair in clouds for c in pair], batch)
@@ -179,16 +198,7 @@ def own_records(
         )
         for k, (s, t) in enumerate(clouds)
     ]
-    found: list[tuple[str, Record]] = []
-    for name, config in settings.items():
-        began = time.perf_counter()
-        poses = register_all(prior, ready, config, upright, batch)
-        seconds = encoding_s + (time.perf_counter() - began) / len(pairs)
-        seconds += looking_s if config.free_weight else 0.0
-        found += [scored(p, T, name, seconds) for p, T in zip(pairs, poses, strict=True)]
-        if closed_by and closed_by.closing.steps and name == next(iter(settings)):
-            found += closed_records(prior, pairs, codes[1::2], poses, closed_by, f"{name}, {CLOSED}", seconds)
-    return found
+    return ready, encoding_s, looking_s
 
 
 def closed_records(
