@@ -203,12 +203,27 @@ def calibrated(
 
 def log_odds(evidence: Evidence, compared: Compared, c: Calibration) -> Float[np.ndarray, "*pairs"]:
     """Of every pair to be one object."""
+    return weighed(features(evidence, compared), c) + compared.color
+
+
+def weighed(known: dict[str, Float[np.ndarray, "*pairs"]], c: Calibration) -> Float[np.ndarray, "*pairs"]:
+    """Log odds of what is known (`features`) by a calibration; without colours."""
+    parts = [getattr(c, name) * value for name, value in known.items()]
+    return c.intercept + np.sum(parts, axis=0)
+
+
+def features(evidence: Evidence, compared: Compared) -> dict[str, Float[np.ndarray, "*pairs"]]:
+    """What each weight of a `Calibration` is multiplied with, by its name."""
     radius = np.asarray(evidence.radius)
     ways = np.stack([evidence.of_source, evidence.of_target])
-    lift = np.minimum(np.asarray(evidence.lift) / (LIFTED * radius), 1.0)
-    top = np.minimum(compared.top_m / radius, HIGHEST)
-    fit = c.intercept + c.nearer * ways.min(axis=0) + c.farther * ways.max(axis=0)
-    fit += c.size * compared.size + c.likeness * compared.likeness + c.lift * lift + c.top * top
     off = np.stack([evidence.off_source, evidence.off_target])
-    fit += c.off_less * off.min(axis=0) + c.off_more * off.max(axis=0)
-    return fit + compared.color
+    return {
+        "nearer": ways.min(axis=0),
+        "farther": ways.max(axis=0),
+        "size": compared.size,
+        "likeness": compared.likeness,
+        "lift": np.minimum(np.asarray(evidence.lift) / (LIFTED * radius), 1.0),
+        "top": np.minimum(compared.top_m / radius, HIGHEST),
+        "off_less": off.min(axis=0),
+        "off_more": off.max(axis=0),
+    }

@@ -23,7 +23,7 @@ from more2_jax.batching import bucket
 from more2_jax.color import color_evidence
 from more2_jax.config import SceneConfig
 from more2_jax.encoding import at_zero, padded, stack, with_origin
-from more2_jax.evidence import HYPOTHESES, Compared, asks_prior, calibrated, pair_evidence
+from more2_jax.evidence import HYPOTHESES, Compared, Evidence, asks_prior, calibrated, pair_evidence
 from more2_jax.prior import Prior, check_embedding
 from more2_jax.types import Color, Embedding, Sight
 
@@ -56,17 +56,37 @@ class PairFits:
     T_old_new: Float[np.ndarray, "n m h 4 4"]  # poses that fit, best first, float64; NaN where never tried
 
 
+@dataclass(frozen=True, kw_only=True)
+class Candidates:
+    """The pairs of objects and instances that are worth aligning, and all that is known of them; p pairs."""
+
+    among: Bool[np.ndarray, "n m"]
+    evidence: Evidence  # poses as in `T_old_new`
+    compared: Compared
+    T_old_new: Float[np.ndarray, "p h 4 4"]  # float64
+
+
 def fit_pairs(prior: Prior, old: Sequence[Known], new: Sequence[Known], config: SceneConfig) -> PairFits:
     """Aligns the likeliest pairs; all of `old` and `new` in one frame, or in two that differ by any motion.
 
     Upright, the frames have one height (see `frames.common_height`). Raises ValueError as `check_known` does.
     """
+    tried = aligned_candidates(prior, old, new, config)
+    odds = np.full(tried.among.shape, NEVER)
+    odds[tried.among] = calibrated(tried.evidence, tried.compared, config.registration, config.upright)
+    poses = np.full((*tried.among.shape, HYPOTHESES, 4, 4), np.nan)
+    poses[tried.among] = tried.T_old_new
+    return PairFits(odds=odds, T_old_new=poses)
+
+
+def aligned_candidates(
+    prior: Prior, old: Sequence[Known], new: Sequence[Known], config: SceneConfig
+) -> Candidates:
+    """The likeliest pairs aligned: what `fit_pairs` weighs. Raises ValueError as `check_known` does."""
     check_known(prior, (*old, *new), config)
     known = compared(old, new)
-    proposal = proposal_of(known, config)
-    candidates = proposed(proposal, config.matching.candidates)
-    rows = np.argwhere(candidates)
-    count = bucket(len(rows), SMALLEST)
+    among = proposed(proposal_of(known, config), config.matching.candidates)
+    rows = np.argwhere(among)
     target, source = (padded([k.points for k in side]) for side in (old, new))
     codes = [
         at_zero(with_origin(stack([k.embedding for k in side])[0], np.asarray(cloud.origin)))
@@ -74,7 +94,7 @@ def fit_pairs(prior: Prior, old: Sequence[Known], new: Sequence[Known], config: 
     ]
     offset = np.asarray(source.origin)[:, None] - np.asarray(target.origin)[None]
     flat = [dataclasses.replace(c, origin=jnp.zeros((len(c.points), 3))) for c in (source, target)]
-    pairs = np.zeros((count, 2), np.int32)
+    pairs = np.zeros((bucket(len(rows), SMALLEST), 2), np.int32)
     pairs[: len(rows)] = rows[:, ::-1]
     found = pair_evidence(
         prior,
@@ -86,14 +106,13 @@ def fit_pairs(prior: Prior, old: Sequence[Known], new: Sequence[Known], config: 
         config.upright,
     )
     evidence = jax.tree.map(lambda x: np.asarray(x)[: len(rows)], jax.device_get(found))
-    result = np.full(proposal.shape, NEVER)
-    poses = np.full((*proposal.shape, HYPOTHESES, 4, 4), np.nan)
-    poses[candidates] = in_frames(
-        evidence.poses, np.asarray(target.origin)[rows[:, 0]], np.asarray(source.origin)[rows[:, 1]]
+    origins = np.asarray(target.origin)[rows[:, 0]], np.asarray(source.origin)[rows[:, 1]]
+    return Candidates(
+        among=among,
+        evidence=evidence,
+        compared=Compared(**{k: v[among] for k, v in vars(known).items()}),
+        T_old_new=in_frames(evidence.poses, *origins),
     )
-    of_candidates = Compared(**{k: v[candidates] for k, v in vars(known).items()})
-    result[candidates] = calibrated(evidence, of_candidates, config.registration, config.upright)
-    return PairFits(odds=result, T_old_new=poses)
 
 
 def check_known(prior: Prior, known: Sequence[Known], config: SceneConfig) -> None:

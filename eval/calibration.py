@@ -1,0 +1,227 @@
+"""How sure it is that two clouds show one object: the weights of the evidence (`more2_jax.evidence`), fitted on rooms.
+
+`python -m eval.calibration --data rooms/paper_free rooms/sparse_free`
+
+For other weights of the prior, or other kinds of rooms. Never on rooms that results are reported on.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+from scipy.optimize import minimize
+from scipy.special import expit
+
+from eval.batched import embed_all
+from eval.flyingshape import flyingshape
+from eval.truth import KnownScene
+from more2_jax.config import SceneConfig, preset
+from more2_jax.evidence import (
+    FREE,
+    UNASKED,
+    UNKNOWN,
+    UPRIGHT,
+    Calibration,
+    asks_prior,
+    features,
+    weighed,
+)
+from more2_jax.prior import Prior, load_prior
+from more2_jax.types import Instance
+from more2_jax.verification import NEVER, Known, aligned_candidates, assign
+from train.program import run
+
+FEWEST = 64  # points of an instance that takes part
+RIDGE = 1e-6  # keeps weights finite where the rooms are told apart without a mistake
+SIGN = {"likeness": 1.0}  # the only evidence that speaks for a pair; all other speaks against it
+TAKEN_AWAY = 0.25  # share of objects and of instances, to see what rejection costs
+TIMES = 8  # that they are taken away anew
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScanPair:
+    """The candidate pairs of two scans: what is known of each, and the truth."""
+
+    room: str
+    among: Bool[np.ndarray, "n m"]
+    known: dict[str, Float[np.ndarray, " p"]]
+    sure: Bool[np.ndarray, " p"]  # the prior knows something of both clouds
+    one: Bool[np.ndarray, "n m"]  # one object, or copies of one
+
+    def odds(self, c: Calibration) -> Float[np.ndarray, "n m"]:
+        """Log odds of all pairs, as the package weighs them."""
+        found = np.full(self.among.shape, NEVER)
+        found[self.among] = np.where(self.sure, weighed(self.known, c), weighed(self.known, UNASKED))
+        return found
+
+
+def main(data: tuple[Path, ...], prior: str = "small", visits: int = 2, scenes: int = 0) -> None:
+    """Fits the log odds of pairs of scans (first and every later one) and says how well they hold.
+
+    Args:
+        data: folders of train.synthesise, all upright or none.
+        prior: name of shipped weights, or a file.
+        visits: scans of a room that take part, from the first; 0 for all.
+        scenes: rooms of a folder, from the first; 0 for all.
+    """
+    rooms = [flyingshape(folder) for folder in data]
+    if len({r.upright for r in rooms}) != 1:
+        raise ValueError(
+            "folders of upright rooms and of others; needed one kind, as each has its own weights"
+        )
+    config, weights = preset("robust", upright=rooms[0].upright), load_prior(prior)
+    pairs: list[ScanPair] = []
+    for folder, benchmark in zip(data, rooms, strict=True):
+        for name in track(benchmark.names[: scenes or None], description=folder.name):
+            pairs += scan_pairs(f"{folder}/{name}", benchmark.read(name).first_scans(visits), weights, config)
+    if not pairs:
+        raise ValueError(f"{', '.join(map(str, data))}: no room with two scans; needed one")
+    report(pairs, asked(config), config)
+
+
+def asked(config: SceneConfig) -> dict[str, Calibration]:
+    """The calibrations that these settings use, by name."""
+    if config.upright:
+        return {"UPRIGHT": UPRIGHT}
+    return (
+        {"FREE": FREE, "UNASKED": UNASKED} if asks_prior(config.registration, False) else {"UNASKED": UNASKED}
+    )
+
+
+def scan_pairs(room: str, scene: KnownScene, prior: Prior, config: SceneConfig) -> list[ScanPair]:
+    """The first scan's objects with those of every later one."""
+    scans = [[i for i in scan.instances if len(i.points) >= FEWEST] for scan in scene.scans]
+    codes = iter(embed_all(prior, [i.points for scan in scans for i in scan], 16))
+    known = [[Known(points=i.points, embedding=next(codes)) for i in scan] for scan in scans]
+    return [
+        scan_pair(room, prior, config, (known[0], known[b]), labels(scene, b, scans[0], scans[b]))
+        for b in range(1, len(scans))
+        if known[0] and known[b]
+    ]
+
+
+def scan_pair(
+    room: str,
+    prior: Prior,
+    config: SceneConfig,
+    sides: tuple[Sequence[Known], Sequence[Known]],
+    one: Bool[np.ndarray, "n m"],
+) -> ScanPair:
+    """Aligns the candidates of two scans."""
+    tried = aligned_candidates(prior, *sides, config)
+    sure = np.asarray(tried.evidence.off_own) <= UNKNOWN
+    return ScanPair(
+        room=room, among=tried.among, known=features(tried.evidence, tried.compared), sure=sure, one=one
+    )
+
+
+def labels(
+    scene: KnownScene, b: int, first: Sequence[Instance], later: Sequence[Instance]
+) -> Bool[np.ndarray, "n m"]:
+    """Which instances of the first scan and of scan `b` show one object, or copies of one."""
+    a = [scene.owner(0, i.id) for i in first]
+    c = [scene.owner(b, i.id) for i in later]
+    return np.array([[x is not None and y is not None and x.copies == y.copies for y in c] for x in a])
+
+
+def fitted(pairs: Sequence[ScanPair], like: Calibration) -> Calibration:
+    """Logistic regression on the evidence that `like` asks, each weight with the sign it must have."""
+    names = [k for k, v in asdict(like).items() if k != "intercept" and v != 0]
+    known = np.concatenate([np.stack([p.known[k] for k in names], axis=1)[p.sure] for p in pairs])
+    one = np.concatenate([p.one[p.among][p.sure] for p in pairs])
+    x = np.concatenate([np.ones((len(known), 1)), known], axis=1)
+
+    def loss(w: np.ndarray) -> tuple[float, np.ndarray]:
+        told = x @ w
+        slope = x.T @ (expit(told) - one) / len(x) + 2 * RIDGE * w
+        return float(log_loss(told, one) + RIDGE * w @ w), slope
+
+    signs = [SIGN.get(k, -1.0) for k in names]
+    bounds = [(None, None), *((0.0, None) if s > 0 else (None, 0.0) for s in signs)]
+    w = minimize(loss, np.zeros(x.shape[1]), jac=True, bounds=bounds, method="L-BFGS-B").x
+    return Calibration(**dict.fromkeys(NONE, 0.0) | dict(zip(["intercept", *names], w.tolist(), strict=True)))
+
+
+NONE = ("intercept", "nearer", "farther", "size", "likeness")  # what a `Calibration` must be told
+
+
+def left_out(pairs: Sequence[ScanPair], like: Calibration) -> dict[str, Calibration]:
+    """Of every room, the weights that the other rooms give."""
+    rooms = dict.fromkeys(p.room for p in pairs)
+    return {room: fitted([p for p in pairs if p.room != room], like) for room in rooms}
+
+
+def log_loss(odds: Float[np.ndarray, " p"], one: Bool[np.ndarray, " p"]) -> float:
+    """Mean, in nats."""
+    return float(np.logaddexp(0.0, np.where(one, -odds, odds)).mean())
+
+
+def report(pairs: Sequence[ScanPair], named: dict[str, Calibration], config: SceneConfig) -> None:
+    """Prints the fitted weights and how well the shipped and the fitted ones tell who is who."""
+    console = Console(width=120)
+    table = Table(
+        "weights", "added", "log loss", "recall", "precision", "a quarter gone: recall", "precision", "F1"
+    )
+    several = len({p.room for p in pairs}) > 1
+    for name, shipped in named.items():
+        add_row(table, f"{name}, shipped", "", pairs, {p.room: shipped for p in pairs})
+        by_room = left_out(pairs, shipped) if several else {}
+        for added in (0.0, 1.0, 2.0, 3.0) if several else ():
+            raised = {k: replace(c, intercept=c.intercept + added) for k, c in by_room.items()}
+            add_row(table, f"{name}, fitted, rooms left out in turn", f"{added:g}", pairs, raised)
+        weights = {k: round(v, 2) for k, v in asdict(fitted(pairs, shipped)).items() if v}
+        console.print(f"{name}, fitted on all: {weights}")
+    count, one = sum(p.among.sum() for p in pairs), sum(p.one[p.among].sum() for p in pairs)
+    console.print(f"{len(pairs)} pairs of scans, {count} pairs of objects, {one} of them one object")
+    console.print(table)
+
+
+def add_row(
+    table: Table, name: str, added: str, pairs: Sequence[ScanPair], by_room: dict[str, Calibration]
+) -> None:
+    """One way to weigh."""
+    odds = [p.odds(by_room[p.room]) for p in pairs]
+    told = np.concatenate([o[p.among] for o, p in zip(odds, pairs, strict=True)])
+    loss = log_loss(told, np.concatenate([p.one[p.among] for p in pairs]))
+    whole = counts([(o, p.one) for o, p in zip(odds, pairs, strict=True)])
+    fewer = counts(thinned(odds, pairs))
+    shares = [f"{100 * x:.1f} %" for x in (*whole[:2], *fewer)]
+    table.add_row(name, added, f"{loss:.3f}", *shares)
+
+
+def thinned(
+    odds: Sequence[Float[np.ndarray, "n m"]], pairs: Sequence[ScanPair]
+) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Log odds and truth with a share of the objects and of the instances taken away at random."""
+    rng = np.random.default_rng(0)
+    found = []
+    for o, p in zip(odds, pairs, strict=True):
+        for _ in range(TIMES):
+            kept = np.ix_(*(rng.random(n) >= TAKEN_AWAY for n in o.shape))
+            found.append((o[kept], p.one[kept]))
+    return found
+
+
+def counts(rooms: Sequence[tuple[np.ndarray, np.ndarray]]) -> tuple[float, float, float]:
+    """Recall, precision and F1 of the assignments; a copy stands in for another, each once."""
+    right = said = true = 0
+    for odds, one in rooms:
+        pairs = assign(odds, np.zeros(odds.shape), 0.0)
+        right, said, true = right + one[tuple(pairs.T)].sum(), said + len(pairs), true + most(one)
+    return right / max(true, 1), right / max(said, 1), 2 * right / max(said + true, 1)
+
+
+def most(one: Bool[np.ndarray, "n m"]) -> int:
+    """As many pairs as can be right at the same time."""
+    return len(assign(np.where(one, 1.0, NEVER), np.zeros(one.shape), 0.0))
+
+
+if __name__ == "__main__":
+    run(main)
