@@ -179,7 +179,7 @@ class Calibration:
 HIGHEST = 0.2
 UNKNOWN = 0.5  # of `off_own`: a prior that lays a cloud so far off its own surface has no say
 # Logistic regression on pairs of validation rooms; how, and how well it holds, is in docs/relocalisation.md.
-UPRIGHT = Calibration(intercept=4.7, nearer=-6.9, farther=-1.0, size=-2.7, likeness=2.6, lift=-2.5, top=-21.0)
+UPRIGHT = Calibration(intercept=3.7, nearer=-6.9, farther=-1.0, size=-2.7, likeness=2.6, lift=-2.5, top=-21.0)
 FREE = Calibration(
     intercept=2.6, nearer=-6.9, farther=0.0, size=-4.0, likeness=7.25, off_less=-11.1, off_more=-6.5
 )
