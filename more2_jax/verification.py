@@ -61,9 +61,9 @@ class Candidates:
     """The pairs of objects and instances that are worth aligning, and all that is known of them; p pairs."""
 
     among: Bool[np.ndarray, "n m"]
-    evidence: Evidence  # poses as in `T_old_new`
+    evidence: Evidence  # its poses are between local frames
     compared: Compared
-    T_old_new: Float[np.ndarray, "p h 4 4"]  # float64
+    T_old_new: Float[np.ndarray, "p h 4 4"]  # those poses between the clouds' frames, float64
 
 
 def fit_pairs(prior: Prior, old: Sequence[Known], new: Sequence[Known], config: SceneConfig) -> PairFits:
