@@ -24,6 +24,7 @@ ALONG = 0.02  # weight of sliding along the surface, against leaving it
 DAMPING = 1e-4  # of the normal equations, in shares of their trace: a ball may turn freely
 NO_TILT = (1.0, 1.0, 1.0, 0.0, 0.0, 1.0)  # shift, and turn about the vertical
 WRITTEN_OUT = 6  # rows of a system: of a pose; what is larger would compile for longer than it runs
+ONE_AXIS = 1e-6  # of matrices of trace 1: what distinguishes eigenvalues by less is rounding
 NEIGHBOURHOOD = 2.5  # half width of a normal's neighbourhood, in median distances between neighbours
 
 
@@ -98,7 +99,7 @@ def normal_estimator(
 
 
 def least_axis(matrix: Float[Array, "*b 3 3"]) -> Float[Array, "*b 3"]:
-    """Unit eigenvector of the smallest eigenvalue of symmetric matrices, in closed form; any where it is repeated."""
+    """Unit eigenvector of the smallest eigenvalue of symmetric matrices, in closed form; where it is repeated, one of them."""
     size = jnp.maximum(jnp.trace(matrix, axis1=-2, axis2=-1), 1e-20)[..., None, None]
     a = matrix / size
     eye = jnp.eye(3, dtype=a.dtype)
@@ -114,7 +115,17 @@ def least_axis(matrix: Float[Array, "*b 3 3"]) -> Float[Array, "*b 3"]:
     longest = jnp.argmax(squared, axis=-1)[..., None]
     axis = jnp.take_along_axis(crossed, longest[..., None], axis=-2)[..., 0, :]
     length = jnp.sqrt(jnp.take_along_axis(squared, longest, axis=-1))
-    return jnp.where(length > 1e-12, axis / jnp.maximum(length, 1e-12), jnp.array([0.0, 0.0, 1.0]))
+    return jnp.where(length > ONE_AXIS, axis / jnp.maximum(length, ONE_AXIS), across(m))
+
+
+def across(rows: Float[Array, "*b 3 3"]) -> Float[Array, "*b 3"]:
+    """A unit vector at right angles to rows that are all along one line; any if they are zero."""
+    longest = jnp.argmax(jnp.sum(rows**2, axis=-1), axis=-1)[..., None, None]
+    line = jnp.take_along_axis(rows, longest, axis=-2)[..., 0, :]
+    least = jnp.argmin(jnp.abs(line), axis=-1)
+    crossed = jnp.cross(line, jnp.eye(3, dtype=rows.dtype)[least])
+    length = jnp.sqrt(jnp.sum(crossed**2, axis=-1, keepdims=True) + 1e-20)
+    return jnp.where(length > ONE_AXIS, crossed / length, jnp.array([0.0, 0.0, 1.0]))
 
 
 def solve_spd(matrix: Float[Array, "n n"], right: Float[Array, "n m"]) -> Float[Array, "n m"]:

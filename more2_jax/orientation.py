@@ -9,12 +9,13 @@ side, the field's slope decides. Votes are then made to agree over a signed grap
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from scipy.sparse import coo_matrix, csr_matrix, diags
 from scipy.sparse.linalg import cg
 from scipy.spatial import KDTree
 
 Points = Float[np.ndarray, "n 3"]
+Neighbours = tuple[Float[np.ndarray, "n k"], Int[np.ndarray, "n k"]]  # distances and indices, nearest first
 
 STEP, STEPS, FARTHEST = (
     1.35,
@@ -39,12 +40,13 @@ def outward_signs(
     gap: float,
     lowest: float,
     seen_from: Float[np.ndarray, "n s 3"] | None = None,
+    known: Neighbours | None = None,
 ) -> Float[np.ndarray, " n"]:
     """+1 where a point's normal goes outward, −1 where inward.
 
     `tree` holds the points (canonical units); `slope` is by how much the field rises along the normal, −1 to 1; `gap`
     is the least way that counts; below the height `lowest` there is no free space. One of the places `seen_from`, if
-    they are known, saw the point; NaN fills up.
+    they are known, saw the point; NaN fills up. `known`: the points' neighbours, if they were searched before.
     """
     points, few = np.asarray(tree.data), np.arange(0, tree.n, -(-tree.n // VOTERS))
     seen = np.zeros(len(few))
@@ -56,7 +58,7 @@ def outward_signs(
     vote[unsure] += np.clip(np.log(ways[0] / ways[1]), -1, 1)
     vote *= 1.0 if seen_from is None else OF_SURROUNDINGS
     vote[few] += seen
-    agreed, _ = cg(*graph(tree, normal, vote), x0=vote, rtol=1e-3, maxiter=200)
+    agreed, _ = cg(*graph(points, normal, vote, known or neighbours_in(tree)), x0=vote, rtol=1e-3, maxiter=200)
     return np.where(agreed < 0, -1.0, 1.0)
 
 
@@ -82,27 +84,32 @@ def first_met(
     tree: KDTree, points: Points, direction: Points, gap: float, lowest: float, width: float = WIDTH
 ) -> Float[np.ndarray, " n"]:
     """How far along `direction` the first other points lie, in a cone of `width` times the way; 1 where none do."""
-    found = np.ones(len(points))
+    found, asked = np.ones(len(points)), np.arange(len(points))
     ways = gap * STEP ** np.arange(STEPS)
-    for way in ways[ways < FARTHEST][::-1]:
-        there = points + way * direction
+    for way in ways[ways < FARTHEST]:
+        there = points[asked] + way * direction[asked]
         met = tree.query(there, distance_upper_bound=width * way)[0] < np.inf
-        found[met | (there[:, 2] < lowest)] = way
+        met |= there[:, 2] < lowest
+        found[asked[met]] = way
+        asked = asked[~met]
     return found
 
 
+def neighbours_in(tree: KDTree) -> Neighbours:
+    """Of every point, itself first."""
+    distance, near = tree.query(np.asarray(tree.data), k=min(NEIGHBOURS + 1, tree.n))
+    return np.asarray(distance), np.asarray(near)
+
+
 def graph(
-    tree: KDTree, normal: Points, vote: Float[np.ndarray, " n"]
+    points: Points, normal: Points, vote: Float[np.ndarray, " n"], known: Neighbours
 ) -> tuple[csr_matrix, Float[np.ndarray, " n"]]:
     """The linear system whose solution weighs every vote against those of neighbours, and its right-hand side.
 
     An edge's sign: whether two normals go to one side of a circle's arc through both points.
     """
-    points = np.asarray(tree.data)
-    count = min(NEIGHBOURS + 1, len(points))
-    distance, near = tree.query(points, k=count)
-    i = np.repeat(np.arange(len(points)), count - 1)
-    j, d = np.asarray(near)[:, 1:].ravel(), np.asarray(distance)[:, 1:].ravel()
+    distance, near = (x[:, 1 : NEIGHBOURS + 1] for x in known)
+    i, j, d = np.repeat(np.arange(len(points)), near.shape[1]), near.ravel(), distance.ravel()
     along = (points[j] - points[i]) / np.maximum(d, 1e-12)[:, None]
     mirrored = normal[j] - 2 * np.einsum("ei,ei->e", normal[j], along)[:, None] * along
     agree = np.einsum("ei,ei->e", normal[i], mirrored)

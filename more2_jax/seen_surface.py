@@ -17,12 +17,11 @@ from scipy.spatial import KDTree
 
 from more2_jax.lattice import Grid, Lattice
 from more2_jax.orientation import outward_signs
+from more2_jax.planes import planes_of
 from more2_jax.screened_poisson import areas, screened
 
 NEIGHBOURS = 12  # points of a plane
 EXACT = 0.1  # share of their own spread: points that lie off their planes by less are exact, and their edges are sharp
-OF_FACE = 6  # points of a plane, where they are exact,
-WIDE = 0.05  # unless their second variance is a smaller share of the first: points of a line lie in any plane
 ASKED = 8  # planes a query hears, of the point nearest to it and of that point's neighbours,
 ASKED_OF_EXACT = 4  # fewer where noise need not be averaged away
 MOST = 16_384  # points that are kept
@@ -124,37 +123,14 @@ def seen_surface(
         return None
     tree = KDTree(points)
     apart, neighbours = map(np.asarray, tree.query(points, k=NEIGHBOURS))
-    center, normal, spread = fitted(points, neighbours)
-    roughness = float(np.sqrt(max(0.0, np.median(spread[:, 0]))))
-    if exact := roughness < EXACT * float(np.sqrt(np.median(spread.sum(axis=1)))):
-        center, normal = points, facing(points, neighbours, normal)
+    found = planes_of(points, neighbours)
+    roughness = float(np.sqrt(max(0.0, np.median(found.off))))
+    exact = roughness < EXACT * float(np.sqrt(np.median(found.spread)))
+    center, normal = (points, found.face) if exact else (found.center, found.normal)
     around = slope[neighbours].sum(axis=1)
     rise = np.einsum("ni,ni->n", normal, around) / np.maximum(np.linalg.norm(around, axis=1), 1e-9)
     gap = GAP * max(float(np.median(apart[:, 1])), LEAST_GAP)
-    signs = outward_signs(tree, normal, rise, gap, lowest, seen_from)
+    signs = outward_signs(tree, normal, rise, gap, lowest, seen_from, (apart, neighbours))
     normal = signs[:, None] * normal
     area = areas(points, normal, apart, neighbours)
     return SeenSurface(tree, center, normal, area, neighbours, reach, gap, roughness, exact)
-
-
-def fitted(points: Points, near: Int[np.ndarray, "n k"]) -> tuple[Points, Points, Float[np.ndarray, "n 3"]]:
-    """The planes of least squares through each point's neighbours: a point of each, its normal (of either sign), and
-    the neighbours' variances along its axes, that of the normal first."""
-    center = points[near].mean(axis=1)
-    offset = points[near] - center[:, None]
-    spread, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", offset, offset) / near.shape[1])
-    return center, axes[:, :, 0], spread
-
-
-def facing(points: Points, near: Int[np.ndarray, "n k"], otherwise: Points) -> Points:
-    """Normals (of either sign) of exact points: of the plane around that its own points and this one lie best in.
-
-    So a point beside an edge has its face's normal, not the mean of two; of a thin leg's narrow sides likewise.
-    `otherwise` where all points around lie in lines, as along a scanner's.
-    """
-    center, normal, spread = fitted(points, near[:, :OF_FACE])
-    off = np.einsum("nki,nki->nk", normal[near], points[:, None] - center[near])
-    is_plane = spread[near, 1] > WIDE * spread[near, 2]
-    best = np.where(is_plane, spread[near, 0] + off**2, np.inf).argmin(axis=1)
-    own = normal[near[np.arange(len(points)), best]]
-    return np.where(np.any(is_plane, axis=1, keepdims=True), own, otherwise)

@@ -62,6 +62,10 @@ def test_least_axis_is_that_of_numpy():
     for degenerate in (np.zeros((3, 3)), np.eye(3), np.diag([1.0, 0, 0])):
         axis = np.asarray(least_axis(jnp.asarray(degenerate, jnp.float32)))
         assert np.isfinite(axis).all() and np.linalg.norm(axis) == pytest.approx(1, abs=1e-4)
+    lines = rng.normal(size=(100, 3))
+    lines /= np.linalg.norm(lines, axis=1, keepdims=True)
+    axes = np.asarray(least_axis(jnp.asarray(lines[:, :, None] * lines[:, None], jnp.float32)))
+    assert np.abs(np.sum(axes * lines, axis=1)).max() < 1e-3  # of what lies along a line: across it
 
 
 @pytest.mark.parametrize(

@@ -49,6 +49,7 @@ LAYERS = {
         "orientation",
         "outliers",
         "lattice",
+        "planes",
         "screened_poisson",
         "seen_surface",
         "meshing",
