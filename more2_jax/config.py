@@ -257,7 +257,7 @@ def preset(name: str, *, upright: bool = False) -> SceneConfig:
             matching=MatchingConfig(score="inv", size_weight=0.5, motion_weight=0.2, verify=True),
             registration=RegistrationConfig(
                 points=256,
-                sdf_points=512,
+                sdf_points=1024,
                 dense=True,
                 starts="many",
                 identity_start=True,

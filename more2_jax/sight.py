@@ -26,7 +26,6 @@ VIEWS = 8  # of an object: places that lie farthest apart, as it sees them
 PIXELS = 96  # at most, a side of a view
 FEWEST_PIXELS = 16
 WIDE = 1.2  # half the width of a view, in that of the object as seen
-PROBES = 1024  # points at most whose neighbours are looked for
 COARSE = 2.5  # pixels are so many times the median angle between neighbouring points of the object
 NEAREST_M = 0.05  # of what lies nearer to a sensor, it sees nothing
 MARGIN_M, MARGIN_PER_M2 = 0.02, 0.005  # kept from a seen point, and more with the square of its distance
@@ -65,8 +64,7 @@ def view_of(cloud: Points, room: Points, eye: Float[np.ndarray, "3"]) -> Sight |
         return None
     image = own[:, :2] / own[:, 2:]
     half = WIDE * float(np.abs(image).max()) + 1e-6
-    some = image[:: -(-len(image) // PROBES)]
-    spacing = float(np.median(KDTree(image).query(some, k=2)[0][:, 1])) if len(image) > 1 else half
+    spacing = float(np.median(KDTree(image).query(image, k=2)[0][:, 1])) if len(image) > 1 else half
     side = int(np.clip(2 * half / (COARSE * spacing + 1e-9), FEWEST_PIXELS, PIXELS))
     seen = (room - eye) @ turn.T
     seen = seen[seen[:, 2] > NEAREST_M]
