@@ -106,7 +106,9 @@ def main(data: Path, prior: str = "base", room: int = 0, out: Path | None = None
     host = host_times(cpu - spent["cpu"], objects, sum(row["estimate_s"] for row in rows.values()))
     print(", ".join(f"{k} {v:.2f}" for k, v in host.items()) + f"; {wall:.1f} s in all here")
     if out is not None:
-        out.write_text(json.dumps({"prior": prior, "stages": rows, "host": host | {"wall_s": wall}}, indent=1) + "\n")
+        out.write_text(
+            json.dumps({"prior": prior, "stages": rows, "host": host | {"wall_s": wall}}, indent=1) + "\n"
+        )
 
 
 def host_times(cpu_s: float, objects: Mapping[str, list[float]], programs_s: float) -> dict[str, float]:
@@ -115,7 +117,12 @@ def host_times(cpu_s: float, objects: Mapping[str, list[float]], programs_s: flo
     shared = sum(map(sum, objects.values()))
     longest = sum(max(seconds, default=0.0) for seconds in objects.values())
     alone = cpu_s - shared
-    return {"cpu_s": cpu_s, "objects_s": shared, "longest_s": longest, "scene_s": programs_s + alone + longest}
+    return {
+        "cpu_s": cpu_s,
+        "objects_s": shared,
+        "longest_s": longest,
+        "scene_s": programs_s + alone + longest,
+    }
 
 
 @contextmanager

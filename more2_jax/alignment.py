@@ -99,7 +99,7 @@ def normal_estimator(
 
 
 def least_axis(matrix: Float[Array, "*b 3 3"]) -> Float[Array, "*b 3"]:
-    """Unit eigenvector of the smallest eigenvalue of symmetric matrices, in closed form; where it is repeated, one of them."""
+    """Unit eigenvector of the smallest eigenvalue of symmetric matrices, in closed form; one where it is repeated."""
     size = jnp.maximum(jnp.trace(matrix, axis1=-2, axis2=-1), 1e-20)[..., None, None]
     a = matrix / size
     eye = jnp.eye(3, dtype=a.dtype)

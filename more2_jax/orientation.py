@@ -58,7 +58,9 @@ def outward_signs(
     vote[unsure] += np.clip(np.log(ways[0] / ways[1]), -1, 1)
     vote *= 1.0 if seen_from is None else OF_SURROUNDINGS
     vote[few] += seen
-    agreed, _ = cg(*graph(points, normal, vote, known or neighbours_in(tree)), x0=vote, rtol=1e-3, maxiter=200)
+    agreed, _ = cg(
+        *graph(points, normal, vote, known or neighbours_in(tree)), x0=vote, rtol=1e-3, maxiter=200
+    )
     return np.where(agreed < 0, -1.0, 1.0)
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,13 +10,13 @@ from jaxtyping import Float, Int
 
 from more2_jax.alignment import least_axis
 from more2_jax.batching import MIN_POINTS, bucket
+from more2_jax.types import pytree
 
 OF_FACE = 6  # points of a plane, where they are exact,
 WIDE = 0.05  # unless their second variance is a smaller share of the first: points of a line lie in any plane
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
 class Planes:
     """Of every point; normals have unit length and either sign."""
 
@@ -30,7 +28,7 @@ class Planes:
 
 
 def planes_of(points: Float[np.ndarray, "n 3"], near: Int[np.ndarray, "n k"]) -> Planes:
-    """`planes` of a host's cloud, padded to few sizes; of its first point, 0, filled-up rows are neighbours."""
+    """`planes` on the host, of a cloud of any size: padded by points that no neighbour of its own names."""
     size = bucket(len(points), MIN_POINTS)
     cloud, rows = np.zeros((size, 3), np.float32), np.zeros((size, near.shape[1]), np.int32)
     cloud[: len(points)], rows[: len(points)] = points, near

@@ -126,7 +126,7 @@ def seen_surface(
     found = planes_of(points, neighbours)
     roughness = float(np.sqrt(max(0.0, np.median(found.off))))
     exact = roughness < EXACT * float(np.sqrt(np.median(found.spread)))
-    center, normal = (points, found.face) if exact else (found.center, found.normal)
+    center, normal = map(np.asarray, (points, found.face) if exact else (found.center, found.normal))
     around = slope[neighbours].sum(axis=1)
     rise = np.einsum("ni,ni->n", normal, around) / np.maximum(np.linalg.norm(around, axis=1), 1e-9)
     gap = GAP * max(float(np.median(apart[:, 1])), LEAST_GAP)

@@ -62,7 +62,12 @@ def test_beside_an_edge_a_face_is_one_of_the_two():
     points, across = edge()
     found = planes_of(points, neighbours(points))
     true = np.eye(3)[across]
-    assert (cosine(found.face, true) > 0.9999).mean() > 0.97 > 0.95 > (cosine(found.normal, true) > 0.9999).mean()
+    assert (
+        (cosine(found.face, true) > 0.9999).mean()
+        > 0.97
+        > 0.95
+        > (cosine(found.normal, true) > 0.9999).mean()
+    )
 
 
 def test_points_of_a_line_lie_in_no_plane():
