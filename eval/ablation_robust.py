@@ -12,14 +12,14 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from eval.figures import Record
-from eval.flyingshape import flyingshape
+from eval.data.flyingshape import flyingshape
 from eval.peers.extra import has
 from eval.peers.registration import many_starts
 from eval.registration import own_records, peer_records, true_pairs
+from eval.scores.figures import Record
 from more2_jax.config import RegistrationConfig, preset
-from more2_jax.prior import load_prior
-from train.program import run
+from more2_jax.network.prior import load_prior
+from train.run.program import run
 
 PEER = "multi-start GICP"
 

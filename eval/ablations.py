@@ -15,23 +15,23 @@ from typing import Annotated
 import numpy as np
 import tyro
 
-from eval.batched import PairToRegister, embed_all, register_all
-from eval.figures import Figure, Record, in_columns
+from eval.data.truth import KnownScene
+from eval.harness.batched import PairToRegister, embed_all, register_all
+from eval.harness.options import Options
+from eval.harness.results import finish
+from eval.harness.runs import run_scenes, start_run
 from eval.matching import RECALL, match_own
 from eval.matching import record as match_record
-from eval.mesh_scores import RECONSTRUCTED, mesh_scores
-from eval.options import Options
-from eval.pose_scores import pose_scores
 from eval.reconstruction import Seen, embedded, fitted_in_batches, mesh_seen, seen_objects, with_joint
 from eval.registration import own_records, own_settings, true_pairs
-from eval.results import finish
-from eval.runs import run_scenes, start_run
-from eval.truth import KnownScene
+from eval.scores.figures import Figure, Record, in_columns
+from eval.scores.mesh_scores import RECONSTRUCTED, mesh_scores
+from eval.scores.pose_scores import pose_scores
 from more2_jax.config import JointConfig, MatchingConfig, SceneConfig
-from more2_jax.fitting import repose
-from more2_jax.prior import Prior
+from more2_jax.network.prior import Prior
+from more2_jax.refinement.joint_of_objects import repose
 from more2_jax.types import SceneObject
-from train.program import run
+from train.run.program import run
 
 RATES = {
     "pose": "pose_learning_rate",

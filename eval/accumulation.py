@@ -17,21 +17,21 @@ import tyro
 from jaxtyping import Float
 from scipy.spatial import KDTree
 
+from eval.data.masks import LOST
+from eval.data.truth import KnownObject, KnownScene
 from eval.end_to_end import living_scenes, on_all_devices
-from eval.figures import Figure, Record
-from eval.masks import LOST
-from eval.mesh_scores import mesh_scores, surface_points
-from eval.options import Options
-from eval.plots import draw_over_scans
-from eval.results import finish
-from eval.runs import run_scenes, start_run
-from eval.tracks import Track, pair_record, track_with, tracks_of
-from eval.truth import KnownObject, KnownScene
+from eval.harness.options import Options
+from eval.harness.plots import draw_over_scans
+from eval.harness.results import finish
+from eval.harness.runs import run_scenes, start_run
+from eval.scores.figures import Figure, Record
+from eval.scores.mesh_scores import mesh_scores, surface_points
+from eval.scores.tracks import Track, pair_record, track_with, tracks_of
 from more2_jax.config import SceneConfig
-from more2_jax.metrics import apply_pose
-from more2_jax.prior import Prior
+from more2_jax.geometry.poses import apply_pose
+from more2_jax.network.prior import Prior
 from more2_jax.scene import reconstruct
-from train.program import run
+from train.run.program import run
 
 COVERED_M = 0.03  # a true point is covered by an accumulated one within it
 COVERAGE_SAMPLES = 4_000

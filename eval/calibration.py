@@ -1,4 +1,4 @@
-"""How sure it is that two clouds show one object: the weights of the evidence (`more2_jax.evidence`), fitted on rooms.
+"""How sure it is that two clouds show one object: the weights of `more2_jax.matching.calibration`, fitted on rooms.
 
 `python -m eval.calibration --data rooms/paper_free rooms/sparse_free`
 
@@ -19,24 +19,17 @@ from rich.table import Table
 from scipy.optimize import minimize
 from scipy.special import expit
 
-from eval.batched import embed_all
-from eval.flyingshape import flyingshape
-from eval.truth import KnownScene
+from eval.data.flyingshape import flyingshape
+from eval.data.truth import KnownScene
+from eval.harness.batched import embed_all
 from more2_jax.config import SceneConfig, preset
-from more2_jax.evidence import (
-    FREE,
-    UNASKED,
-    UNKNOWN,
-    UPRIGHT,
-    Calibration,
-    asks_prior,
-    features,
-    weighed,
-)
-from more2_jax.prior import Prior, load_prior
-from more2_jax.types import Instance
-from more2_jax.verification import NEVER, Known, aligned_candidates, assign
-from train.program import run
+from more2_jax.matching.assignment import NEVER, assign
+from more2_jax.matching.calibration import FREE, UNASKED, UNKNOWN, UPRIGHT, Calibration, features, weighed
+from more2_jax.matching.candidates import aligned_candidates
+from more2_jax.matching.pair_evidence import asks_prior
+from more2_jax.network.prior import Prior, load_prior
+from more2_jax.types import Instance, ObservedObject
+from train.run.program import run
 
 FEWEST = 64  # points of an instance that takes part
 RIDGE = 1e-6  # keeps weights finite where the rooms are told apart without a mistake
@@ -100,7 +93,7 @@ def scan_pairs(room: str, scene: KnownScene, prior: Prior, config: SceneConfig) 
     """The first scan's objects with those of every later one."""
     scans = [[i for i in scan.instances if len(i.points) >= FEWEST] for scan in scene.scans]
     codes = iter(embed_all(prior, [i.points for scan in scans for i in scan], 16))
-    known = [[Known(points=i.points, embedding=next(codes)) for i in scan] for scan in scans]
+    known = [[ObservedObject(points=i.points, embedding=next(codes)) for i in scan] for scan in scans]
     return [
         scan_pair(room, prior, config, (known[0], known[b]), labels(scene, b, scans[0], scans[b]))
         for b in range(1, len(scans))
@@ -112,7 +105,7 @@ def scan_pair(
     room: str,
     prior: Prior,
     config: SceneConfig,
-    sides: tuple[Sequence[Known], Sequence[Known]],
+    sides: tuple[Sequence[ObservedObject], Sequence[ObservedObject]],
     one: Bool[np.ndarray, "n m"],
 ) -> ScanPair:
     """Aligns the candidates of two scans."""

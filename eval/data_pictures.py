@@ -13,11 +13,11 @@ import trimesh
 from jaxtyping import Float
 from trimesh.ray.ray_pyembree import RayMeshIntersector
 
-from more2_jax.data.depth_views import view_directions
-from more2_jax.data.shards import open_shards, read_meta, read_solids, shard_folders
-from more2_jax.data.signed_distance import BOX, is_inside
-from more2_jax.data.source_mesh import SourceMesh
-from train.program import run
+from train.furniture.source_mesh import SourceMesh
+from train.run.program import run
+from train.shards.depth_views import view_directions
+from train.shards.shards import open_shards, read_meta, read_solids, shard_folders
+from train.shards.signed_distance import BOX, is_inside
 
 EYE = np.array([1.1, -1.5, 0.8])
 PIXELS = 110

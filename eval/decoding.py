@@ -21,18 +21,18 @@ from jaxtyping import Float
 from rich.console import Console
 from rich.progress import track
 
-from eval.figures import Figure, Record, rows_of
+from eval.harness.results import circumstances_now
+from eval.harness.runs import weights_digest, write_json
+from eval.harness.tables import latex, markdown, on_screen
 from eval.peers.learned_decoders import VARIANTS, decoder_of, decoder_step, drawn, optimiser, start
 from eval.prior_scores import BATCH, SEEN, see_twice
-from eval.results import circumstances_now
-from eval.runs import weights_digest, write_json
-from eval.tables import latex, markdown, on_screen
+from eval.scores.figures import Figure, Record, rows_of
 from more2_jax.config import TrainingConfig, TrainingRun, load_config
-from more2_jax.data.shards import open_shards
-from more2_jax.geometry import farthest_points
-from more2_jax.prior import Prior, encode_ordered, field_sdf, load_prior, object_field
-from train.program import run
-from train.shape_mix import load_mix
+from more2_jax.geometry.points import farthest_points
+from more2_jax.network.prior import Prior, encode_ordered, field_sdf, load_prior, object_field
+from train.run.program import run
+from train.run.shape_mix import load_mix
+from train.shards.shards import open_shards
 
 OWN = "as shipped: inner, DeepSDF, look-up, trained longer"
 SIGN = Figure(name="sign near the surface", key="sign", statistic="mean", unit="%", scale=100)

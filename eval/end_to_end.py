@@ -17,18 +17,18 @@ from typing import Annotated, Any
 import jax
 import tyro
 
-from eval.figures import Figure, Record, in_columns
-from eval.options import Options
+from eval.data.truth import KnownScene
+from eval.harness.options import Options
+from eval.harness.results import finish
+from eval.harness.runs import run_scenes, start_run
 from eval.peers.end_to_end import NAME, combined
-from eval.results import finish
-from eval.runs import run_scenes, start_run
-from eval.tracks import Track, changes_f1, score_tracks, tracks_of
-from eval.truth import KnownScene
+from eval.scores.figures import Figure, Record, in_columns
+from eval.scores.tracks import Track, changes_f1, score_tracks, tracks_of
 from more2_jax.config import SceneConfig
-from more2_jax.prior import Prior
+from more2_jax.network.prior import Prior
 from more2_jax.scene import add_scan, reconstruct, start_scene
 from more2_jax.types import LivingScene
-from train.program import run
+from train.run.program import run
 
 
 @dataclass(frozen=True, kw_only=True)

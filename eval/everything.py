@@ -14,8 +14,8 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from eval import ablations, accumulation, end_to_end, matching, reconstruction, registration, report
-from eval.options import Masks, Options
-from train.program import run
+from eval.harness.options import Masks, Options
+from train.run.program import run
 
 Program = Literal["matching", "registration", "reconstruction", "end_to_end", "accumulation", "ablations"]
 PROGRAMS: dict[Program, tuple[Any, type[Options]]] = {

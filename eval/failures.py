@@ -11,20 +11,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 from scipy.spatial import KDTree
 
-from eval.figures import Record
-from eval.flyingshape import flyingshape
-from eval.plots import pyplot, save
-from eval.pose_scores import evenly
-from eval.runs import write_json
-from eval.tables import number
-from eval.truth import KnownObject, KnownScene
-from more2_jax.metrics import apply_pose
-from train.program import run
-
-Points = Float[np.ndarray, "_ 3"]
+from eval.data.flyingshape import flyingshape
+from eval.data.truth import KnownObject, KnownScene
+from eval.harness.plots import pyplot, save
+from eval.harness.runs import write_json
+from eval.harness.tables import number
+from eval.scores.figures import Record
+from eval.scores.pose_scores import evenly
+from more2_jax.geometry.poses import Points, apply_pose
+from train.run.program import run
 
 NEAR_DEG = 15.0  # of a quarter or half turn; and what is a slip rather than another place
 LITTLE_OVERLAP = 0.5  # share of what either cloud shows that both show

@@ -16,8 +16,8 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from eval.plots import pyplot, save
-from train.program import run
+from eval.harness.plots import pyplot, save
+from train.run.program import run
 
 # What `small` is meant to reach with clouds of three views and of one.
 TARGETS: dict[str, dict[str, float]] = {

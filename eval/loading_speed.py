@@ -13,9 +13,9 @@ from rich.console import Console
 from rich.table import Table
 
 from more2_jax.config import TrainingRun, load_config
-from more2_jax.data.loading import sample_records, training_records, training_samples
-from more2_jax.data.shards import open_shards
-from train.program import run
+from train.run.program import run
+from train.shards.loading import sample_records, training_records, training_samples
+from train.shards.shards import open_shards
 
 
 def main(

@@ -16,21 +16,21 @@ from typing import Annotated
 import numpy as np
 import tyro
 
-from eval.batched import embed_all
-from eval.figures import COLUMNS, Figure, Record, in_columns
-from eval.match_scores import match_scores, partners
-from eval.options import Options, benchmark, is_upright
+from eval.data.truth import KnownScene
+from eval.harness.batched import embed_all
+from eval.harness.options import Options, benchmark, is_upright
+from eval.harness.results import finish
+from eval.harness.runs import run_scenes, start_run
 from eval.peers import classifier
 from eval.peers.matching import Matcher, matchers
-from eval.results import finish
-from eval.runs import run_scenes, start_run
-from eval.truth import KnownScene
+from eval.scores.figures import COLUMNS, Figure, Record, in_columns
+from eval.scores.match_scores import match_scores, partners
 from more2_jax.config import MatchingConfig, SceneConfig, preset
-from more2_jax.objects import new_object
-from more2_jax.prior import Prior
-from more2_jax.tracking import match_scan
+from more2_jax.network.prior import Prior
+from more2_jax.tracking.identify import match_scan
+from more2_jax.tracking.objects import new_object
 from more2_jax.types import Embedding, Instance
-from train.program import run
+from train.run.program import run
 
 SHARES = (25, 50, 75, 100)  # %: of a scan pair's objects, for scene recall
 

@@ -21,10 +21,10 @@ from rich.console import Console
 from rich.table import Table
 
 from more2_jax.config import SceneConfig
-from more2_jax.prior import encode_ordered, load_prior
+from more2_jax.network.prior import encode_ordered, load_prior
 from more2_jax.report import write_report
 from more2_jax.types import Changes, Embedding, LivingScene, Mesh, Observation, ScanRecord, SceneObject
-from train.program import run
+from train.run.program import run
 
 SOFTWARE_GL = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 FRAMES = 15

@@ -26,14 +26,14 @@ from rich.table import Table
 from scipy.spatial.transform import Rotation
 
 from more2_jax.config import MatchingConfig
-from more2_jax.data.flying_shape import yaw_symmetry
-from more2_jax.data.shards import ShardView, open_shards, read_solids, shard_folders
-from more2_jax.geometry import farthest_points, kabsch_rotation
-from more2_jax.matching import hungarian, score_matrix
+from more2_jax.geometry.points import farthest_points, kabsch_rotation
+from more2_jax.matching.code_assignment import hungarian, score_matrix
 from more2_jax.metrics import bootstrap_ci95, symmetry_aware_rotation_error_deg
-from more2_jax.prior import Prior, encode_ordered, field_sdf, load_prior, object_field
+from more2_jax.network.prior import Prior, encode_ordered, field_sdf, load_prior, object_field
 from more2_jax.types import Embedding
-from train.program import run
+from train.rooms.ray_scanner import yaw_symmetry
+from train.run.program import run
+from train.shards.shards import ShardView, open_shards, read_solids, shard_folders
 
 BATCH = 8
 RIGHT_DEG = 10.0

@@ -18,22 +18,23 @@ import numpy as np
 import tyro
 from jaxtyping import Float, Int
 
-from eval.batched import embed_all
-from eval.figures import Column, Figure, Record
-from eval.masks import LOST
-from eval.mesh_scores import RECONSTRUCTED, mesh_scores
-from eval.options import Options
+from eval.data.masks import LOST
+from eval.data.truth import KnownObject, KnownScene
+from eval.harness.batched import embed_all
+from eval.harness.options import Options
+from eval.harness.results import finish
+from eval.harness.runs import run_scenes, start_run
 from eval.peers.reconstruction import SURFACERS, Surfacer
-from eval.results import finish
-from eval.runs import run_scenes, start_run
-from eval.truth import KnownObject, KnownScene
+from eval.scores.figures import Column, Figure, Record
+from eval.scores.mesh_scores import RECONSTRUCTED, mesh_scores
 from more2_jax.config import SceneConfig, preset
-from more2_jax.fitting import fit_objects
-from more2_jax.metrics import apply_pose
-from more2_jax.prior import Prior
-from more2_jax.scene import mesh_of, record
+from more2_jax.geometry.poses import apply_pose
+from more2_jax.meshing.object_mesh import mesh_of
+from more2_jax.network.prior import Prior
+from more2_jax.refinement.joint_of_objects import fit_objects
+from more2_jax.scene import record
 from more2_jax.types import Mesh, Observation, SceneObject
-from train.program import run
+from train.run.program import run
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -15,22 +15,22 @@ from typing import Annotated, Literal
 import numpy as np
 import tyro
 
-from eval.batched import PairToRegister, embed_all, register_all
-from eval.closed_pairs import closed_poses
-from eval.figures import Figure, Record, in_columns
-from eval.masks import LOST
-from eval.options import Options, benchmark, is_upright
+from eval.data.masks import LOST
+from eval.data.truth import KnownObject, KnownScene
+from eval.harness.batched import PairToRegister, embed_all, register_all
+from eval.harness.closed_pairs import closed_poses
+from eval.harness.options import Options, benchmark, is_upright
+from eval.harness.plots import draw_ecdf
+from eval.harness.results import finish
+from eval.harness.runs import run_scenes, start_run
 from eval.peers.registration import Registrar, registrars
-from eval.plots import draw_ecdf
-from eval.pose_scores import Pose, pose_scores
-from eval.results import finish
-from eval.runs import run_scenes, start_run
-from eval.truth import KnownObject, KnownScene
+from eval.scores.figures import Figure, Record, in_columns
+from eval.scores.pose_scores import Pose, pose_scores
 from more2_jax.config import RegistrationConfig, SceneConfig, preset
-from more2_jax.prior import Prior
-from more2_jax.sight import sight_of
+from more2_jax.geometry.free_space import sight_of
+from more2_jax.network.prior import Prior
 from more2_jax.types import Embedding, Scan, Sight
-from train.program import run
+from train.run.program import run
 
 CLOSED = "laid onto one another"
 KABSCH = "Kabsch on F_eqv alone"  # a learned peer, as FreeReg: one look at the codes

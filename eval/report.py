@@ -11,11 +11,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from eval.figures import Row
-from eval.paper_numbers import quoted
-from eval.results import portable
-from eval.tables import best, heading, markdown_table, number
-from train.program import run
+from eval.harness.paper_numbers import quoted
+from eval.harness.results import portable
+from eval.harness.tables import best, heading, markdown_table, number
+from eval.scores.figures import Row
+from train.run.program import run
 
 TITLES = {
     "end_to_end": "End to end",

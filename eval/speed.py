@@ -24,17 +24,17 @@ import numpy as np
 import optax
 from jax import Array
 
-from eval import plain_layers
-from eval.stopwatch import Job, Seconds, interleaved, timed
+from eval.performance import plain_layers
+from eval.performance.stopwatch import Job, Seconds, interleaved, timed
 from more2_jax.config import PriorConfig, TrainingRun, load_config
-from more2_jax.decoder import Decoder
-from more2_jax.geometry import farthest_points
-from more2_jax.in_turn import in_turn
-from more2_jax.losses import AT_ONCE
-from more2_jax.prior import Prior, encode_ordered, init_prior
-from train.devices import by_rows, cores, device_a_core, device_mesh, everywhere
-from train.memory import GLIBC_KEEPS_MEMORY, keep_freed_memory
-from train.program import run
+from more2_jax.geometry.points import farthest_points
+from more2_jax.network.decoder import Decoder
+from more2_jax.network.prior import Prior, encode_ordered, init_prior
+from more2_jax.network.row_map import in_turn
+from train.run.devices import by_rows, cores, device_a_core, device_mesh, everywhere
+from train.run.memory import GLIBC_KEEPS_MEMORY, keep_freed_memory
+from train.run.program import run
+from train.shards.losses import AT_ONCE
 
 WHAT = {"forward": "encoder forward", "encoder_step": "encoder and its gradient", "step": "training step"}
 WANTED = {"forward": 5.0, "step": 4.0}  # times the published layers
@@ -168,7 +168,7 @@ def torch_jobs(
     if not interpreter:
         yield {}, ""
         return
-    script = str(Path(__file__).with_name("torch_layers.py"))
+    script = str(Path(__file__).parent / "performance" / "torch_layers.py")
     pipe = subprocess.PIPE
     environment = os.environ | GLIBC_KEEPS_MEMORY
     with subprocess.Popen(

@@ -16,15 +16,15 @@ from rich.table import Table
 from scipy.optimize import linear_sum_assignment
 
 from more2_jax.config import SceneConfig, preset
-from more2_jax.data.flying_scenes import FlyingConfig, FlyingScene, TrueObject, flying_scene
-from more2_jax.data.flying_shape import yaw_symmetry
-from more2_jax.data.heldout import read_ikea
-from more2_jax.data.meshes import SourceMesh, read_meshes
 from more2_jax.metrics import bootstrap_ci95, f1, symmetry_aware_rotation_error_deg
-from more2_jax.prior import Prior, load_prior
+from more2_jax.network.prior import Prior, load_prior
 from more2_jax.scene import add_scan, start_scene
 from more2_jax.types import LivingScene
-from train.program import run
+from train.furniture.collections import SourceMesh, read_meshes
+from train.furniture.heldout import read_ikea
+from train.rooms.ray_scanner import yaw_symmetry
+from train.rooms.visits import FlyingConfig, FlyingScene, TrueObject, flying_scene
+from train.run.program import run
 
 RIGHT_DEG = 5.0
 VERTICAL = np.array([0.0, 0, 1])

@@ -9,8 +9,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 import more2_jax as m2
-from more2_jax.data.demo import demo_scan_paths
-from more2_jax.metrics import apply_pose, rotation_error_deg
+from more2_jax.geometry.poses import apply_pose, rotation_error_deg
+from more2_jax.scans.demo import demo_scan_paths
 
 rng = np.random.default_rng(0)
 scan = m2.read_scan(demo_scan_paths()[0])

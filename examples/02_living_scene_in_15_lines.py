@@ -4,7 +4,7 @@ You learn: the three calls of the method (`start_scene`, `add_scan`, `reconstruc
 """
 
 import more2_jax as m2
-from more2_jax.data.demo import demo_scan_paths
+from more2_jax.scans.demo import demo_scan_paths
 
 prior, config = m2.load_prior("small"), m2.preset("robust", upright=True)
 first, *later = [m2.read_scan(path) for path in demo_scan_paths()]

@@ -9,10 +9,10 @@ import jax.numpy as jnp
 
 import more2_jax as m2
 from more2_jax.config import RegistrationConfig
-from more2_jax.geometry import sample
-from more2_jax.prior import encode_one
-from more2_jax.registration import register_one
-from more2_jax.starts import Pair
+from more2_jax.geometry.points import sample
+from more2_jax.network.prior import encode_one
+from more2_jax.registration.register import register_one
+from more2_jax.registration.starting_poses import Pair
 
 jax.config.update("jax_enable_x64", True)  # finite differences need the digits; gradients alone do not
 

@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 
 import more2_jax as m2
 from more2_jax.config import RegistrationConfig
-from more2_jax.data.demo import demo_scan_paths
-from more2_jax.metrics import apply_pose, rotation_error_deg
+from more2_jax.geometry.poses import apply_pose, rotation_error_deg
+from more2_jax.scans.demo import demo_scan_paths
 
 PAIRS = 100
 rng = np.random.default_rng(0)

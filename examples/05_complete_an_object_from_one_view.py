@@ -10,9 +10,10 @@ import numpy as np
 import trimesh
 
 import more2_jax as m2
-from more2_jax.data.demo import demo_ground_truth, demo_scan_paths
-from more2_jax.meshing import observed_level
-from more2_jax.metrics import accuracy, apply_pose
+from more2_jax.geometry.poses import apply_pose
+from more2_jax.meshing.extract import observed_level
+from more2_jax.metrics import accuracy
+from more2_jax.scans.demo import demo_ground_truth, demo_scan_paths
 
 truth = demo_ground_truth()
 chair = truth.at(0, 5)

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 import more2_jax as m2
-from more2_jax.data.demo import demo_scan_paths
+from more2_jax.scans.demo import demo_scan_paths
 
 prior, config = m2.load_prior("small"), m2.preset("robust", upright=True)
 monday, friday, next_week = (m2.read_scan(path) for path in demo_scan_paths())

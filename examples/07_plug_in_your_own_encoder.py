@@ -12,8 +12,8 @@ import jax
 import numpy as np
 
 import more2_jax as m2
-from more2_jax.data.demo import demo_ground_truth, demo_scan_paths
-from more2_jax.demo import pose_error
+from more2_jax.cli.demo_score import pose_error
+from more2_jax.scans.demo import demo_ground_truth, demo_scan_paths
 from more2_jax.types import Observation
 
 prior = m2.load_prior("small")

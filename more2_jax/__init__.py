@@ -20,31 +20,33 @@ _HOMES = {
         "LivingScene",
     ),
     "config": ("SceneConfig", "load_config", "preset"),
-    "prior": ("Prior", "encode", "init_prior", "load_prior", "save_prior", "sdf"),
-    "batching": ("pad_clouds",),
-    "geometry": ("chamfer_distance", "kabsch"),
-    "matching": ("match_instances",),
-    "registration": ("register", "world_pose"),
-    "meshing": ("extract_mesh",),
-    "joint": ("fit_jointly",),
+    "network.prior": ("Prior", "encode", "init_prior", "load_prior", "save_prior", "sdf"),
+    "geometry.padding": ("pad_clouds",),
+    "geometry.points": ("chamfer_distance", "kabsch"),
+    "matching.code_assignment": ("match_instances",),
+    "registration.register": ("register",),
+    "geometry.poses": ("world_pose",),
+    "meshing.extract": ("extract_mesh",),
+    "refinement.joint": ("fit_jointly",),
     "scene": ("add_scan", "reconstruct", "start_scene"),
-    "data.scans": ("read_scan",),
-    "io": ("load_scene", "save_scene"),
+    "scans.read_scan": ("read_scan",),
+    "storage.scene_folder": ("load_scene", "save_scene"),
 }
 _HOME_OF = {name: module for module, names in _HOMES.items() for name in names}
 
 if TYPE_CHECKING:
-    from more2_jax.batching import pad_clouds
     from more2_jax.config import SceneConfig, load_config, preset
-    from more2_jax.data.scans import read_scan
-    from more2_jax.geometry import chamfer_distance, kabsch
-    from more2_jax.io import load_scene, save_scene
-    from more2_jax.joint import fit_jointly
-    from more2_jax.matching import match_instances
-    from more2_jax.meshing import extract_mesh
-    from more2_jax.prior import Prior, encode, init_prior, load_prior, save_prior, sdf
-    from more2_jax.registration import register, world_pose
+    from more2_jax.geometry.padding import pad_clouds
+    from more2_jax.geometry.points import chamfer_distance, kabsch
+    from more2_jax.geometry.poses import world_pose
+    from more2_jax.matching.code_assignment import match_instances
+    from more2_jax.meshing.extract import extract_mesh
+    from more2_jax.network.prior import Prior, encode, init_prior, load_prior, save_prior, sdf
+    from more2_jax.refinement.joint import fit_jointly
+    from more2_jax.registration.register import register
+    from more2_jax.scans.read_scan import read_scan
     from more2_jax.scene import add_scan, reconstruct, start_scene
+    from more2_jax.storage.scene_folder import load_scene, save_scene
     from more2_jax.types import (
         Embedding,
         Instance,

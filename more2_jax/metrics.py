@@ -10,15 +10,9 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
-Points = Float[np.ndarray, "_ 3"]  # clouds of one call differ in size
+from more2_jax.geometry.poses import Matrix3, Points, Pose, apply_pose, rotation_error_deg
+
 Errors = Sequence[float] | Float[np.ndarray, " n"]
-Matrix3 = Float[np.ndarray, "3 3"]
-Pose = Float[np.ndarray, "4 4"]
-
-
-def rotation_error_deg(R: Matrix3, R_true: Matrix3) -> float:
-    """Angle of the rotation between two rotations: arccos((tr(Rᵀ R̄) − 1)/2), by a form that is exact near 0 too."""
-    return float(np.rad2deg(Rotation.from_matrix(R.T @ R_true).magnitude()))
 
 
 def symmetry_aware_rotation_error_deg(
@@ -70,11 +64,6 @@ def instance_recall(
 def scene_recall(recalls: Errors, share: float) -> float:
     """Share of scan pairs whose own instance recall is at least `share`."""
     return float(np.mean(np.asarray(recalls) >= share)) if len(recalls) else float("nan")
-
-
-def apply_pose(T_a_b: Pose, points: Points) -> Points:
-    """Points of frame b in frame a; float64."""
-    return points @ T_a_b[:3, :3].T + T_a_b[:3, 3]
 
 
 def transformation_rmse(T: Pose, T_true: Pose, source: Points, target: Points) -> float:

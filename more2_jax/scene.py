@@ -3,42 +3,31 @@
 from __future__ import annotations
 
 import dataclasses
-import os
-from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 
 import numpy as np
 from jaxtyping import Float
 
-from more2_jax.closing import close_objects
 from more2_jax.config import SceneConfig
-from more2_jax.encoding import embed
-from more2_jax.fitting import embed_accumulated, fit_objects
-from more2_jax.frames import Rooms, floor_height
-from more2_jax.meshing import extract_mesh, observed_level
-from more2_jax.metrics import apply_pose
-from more2_jax.objects import (
+from more2_jax.geometry.poses import apply_pose
+from more2_jax.meshing.object_mesh import floor_of, meshes_of, seen_often
+from more2_jax.network.embedding_batch import embed
+from more2_jax.network.prior import Prior
+from more2_jax.progress import Watcher, staged
+from more2_jax.refinement.joint_of_objects import embed_accumulated, fit_objects
+from more2_jax.refinement.pose_graph_of_objects import close_objects
+from more2_jax.tracking.identify import match_scan, register_in_frame
+from more2_jax.tracking.object_views import few_sensors, instances_with_sight, objects_with_sight
+from more2_jax.tracking.objects import (
     SCENE_FRAME,
-    accumulated,
-    accumulated_points,
     changes_between,
     new_object,
     seen_again,
 )
-from more2_jax.outliers import inliers
-from more2_jax.prior import Prior
-from more2_jax.progress import Watcher, staged
-from more2_jax.seen_surface import some_of
-from more2_jax.sights import few_sensors, instances_with_sight, objects_with_sight, seen_from
-from more2_jax.tracking import match_scan, register_in_frame
-from more2_jax.types import Frame, Instance, LivingScene, Mesh, Scan, ScanRecord, SceneObject, Skipped
+from more2_jax.tracking.scan_frame import Rooms
+from more2_jax.types import Frame, Instance, LivingScene, Scan, ScanRecord, Skipped
 
 BACKGROUND_POINTS = 20_000  # of a scan, remembered for the page and for what its sensors looked through
-STRAYS = 0.02  # share of an object's points that may lie below the floor,
-BELOW_M = 0.05  # by more than this
-# About 70 MB each: a scene of eight objects took 662 MB one at a time, 1,131 MB all at once.
-MESHES_AT_ONCE = 8
 
 
 def start_scene(
@@ -134,69 +123,6 @@ def reconstruct(
         changes_between(objects, c.from_scan, c.to_scan, config, c.probability) for c in scene.changes
     )
     return dataclasses.replace(scene, objects=tuple(objects), changes=changes, timing_s=timing)
-
-
-def floor_under(o: SceneObject, background: Float[np.ndarray, "b 3"], config: SceneConfig) -> float | None:
-    """Height of the floor in an object's frame, metres; `background` is that of its reference scan.
-
-    None if it is not asked for, there is none to see, or the object was seen clearly below it: then it is another's.
-    """
-    if not (config.upright and config.meshing.floor):
-        return None
-    floor = floor_height(background)
-    if floor is None or float(np.quantile(accumulated_points(o)[:, 2], STRAYS)) < floor - BELOW_M:
-        return None
-    return floor
-
-
-def floor_of(o: SceneObject, scans: Sequence[ScanRecord], config: SceneConfig) -> float | None:
-    """`floor_under` an object in its reference scan."""
-    return floor_under(o, scans[o.reference_scan].background, config)
-
-
-def meshes_of(
-    prior: Prior, objects: Sequence[SceneObject], scans: Sequence[ScanRecord], config: SceneConfig
-) -> Iterator[Mesh | None]:
-    """The objects' meshes in their order, `MESHES_AT_ONCE` worked on side by side: most steps keep one core busy."""
-    with ThreadPoolExecutor(min(MESHES_AT_ONCE, os.cpu_count() or 1)) as pool:
-        yield from pool.map(lambda o: mesh_of(prior, o, scans, config), objects)
-
-
-def mesh_of(prior: Prior, o: SceneObject, scans: Sequence[ScanRecord], config: SceneConfig) -> Mesh | None:
-    """The object's mesh, in a box that holds all that was seen of it, and above the floor of its reference scan.
-
-    `level` "observed": seen points lie on the surface, so the field's median there is its bias, and is taken off.
-    """
-    points, eyes = trusted(o, scans, config)
-    level = observed_level(prior, o.embedding, points) if config.meshing.level == "observed" else 0.0
-    floor = floor_of(o, scans, config)
-    half, meshing = box_half_width(o, config), config.meshing
-    if not seen_often(o):
-        meshing = dataclasses.replace(meshing, screening_of_many=0.0)
-    return extract_mesh(prior, o.embedding, meshing, half, level, points, floor, eyes)
-
-
-def seen_often(o: SceneObject) -> bool:
-    """Whether several scans make up its shape."""
-    return len(accumulated(o)) > 1
-
-
-def trusted(
-    o: SceneObject, scans: Sequence[ScanRecord], config: SceneConfig
-) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n s 3"] | None]:
-    """What was seen of an object without outliers, thinned, in its frame; and from where, if that is known and used."""
-    points = some_of(accumulated_points(o))
-    eyes = seen_from(o, scans) if config.meshing.seen_reach else None
-    most = config.meshing.outlier_factor_of_many if seen_often(o) else config.meshing.outlier_factor
-    kept = inliers(points, most)
-    return points[kept], None if eyes is None else some_of(eyes)[kept]
-
-
-def box_half_width(o: SceneObject, config: SceneConfig) -> float:
-    """Half the edge of the box to mesh, canonical units: at least the usual, and all of what was seen."""
-    center = np.asarray(o.embedding.center, np.float64) + o.embedding.origin
-    seen = np.quantile(np.abs(accumulated_points(o) - center).max(axis=1), 0.99) / float(o.embedding.scale)
-    return float(np.clip(1.15 * seen, config.meshing.half_width, 3 * config.meshing.half_width))
 
 
 def usable(scan: Scan, config: SceneConfig) -> tuple[list[Instance], tuple[Skipped, ...]]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import TypeVar, dataclass_transform
@@ -12,6 +11,8 @@ import jaxlie
 import numpy as np
 from jax import Array
 from jaxtyping import Bool, Float, Int
+
+from more2_jax.geometry.poses import Points
 
 T = TypeVar("T")
 
@@ -69,19 +70,6 @@ class Embedding:
     center: Float[Array, "*batch 3"]  # F_c, metres, relative to `origin`
     origin: Float[Array | np.ndarray, "*batch 3"]  # metres, in the scan's frame
     anchors: tuple[Anchors, ...] = ()  # a level each; none where the decoder reads the four codes alone
-
-
-def scale_embedding(e: Embedding, factor: Float[Array, ""]) -> Embedding:
-    """The embedding of the same object in other units of length. One object."""
-    anchors = tuple(dataclasses.replace(a, offset=a.offset * factor) for a in e.anchors)
-    return dataclasses.replace(e, scale=e.scale * factor, center=e.center * factor, anchors=anchors)
-
-
-def move_embedding(e: Embedding, T_b_a: jaxlie.SE3) -> Embedding:
-    """The embedding of a moved object: Φ is equivariant, so nothing is encoded again. One object; local frames."""
-    R = T_b_a.rotation().as_matrix()
-    anchors = tuple(dataclasses.replace(a, offset=a.offset @ R.T, features=R @ a.features) for a in e.anchors)
-    return dataclasses.replace(e, eqv=R @ e.eqv, center=T_b_a @ e.center, anchors=anchors)
 
 
 @pytree
@@ -266,3 +254,13 @@ class LivingScene:
     changes: tuple[Changes, ...]
     timing_s: dict[str, float] = field(default_factory=dict)
     unit: str = "m"
+
+
+@dataclass(frozen=True, kw_only=True)
+class ObservedObject:
+    """An object or an instance as it is compared: points and embedding in one scan's frame."""
+
+    points: Points
+    embedding: Embedding
+    color: Color | None = None
+    sight: Sight | None = None

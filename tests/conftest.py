@@ -13,8 +13,9 @@ from places import ROOT
 # Before anything of more2_jax is imported: every call's shapes and dtypes are held against its annotations. Not in
 # `types`, whose records pass through JAX's transformations, nor where values of any kind are taken and refused.
 CHECKED = (
-    "batching color decoder descent encoder encoding geometry joint losses matching meshing metrics objects prior "
-    "registration starts tracking vn"
+    "geometry.padding matching.color network.decoder geometry.se3_descent network.encoder network.embedding_batch "
+    "geometry.points refinement.joint matching.code_assignment meshing.extract metrics tracking.objects network.prior "
+    "registration.register registration.starting_poses tracking.identify network.vector_neurons"
 )
 install_import_hook([f"more2_jax.{name}" for name in CHECKED.split()], "beartype.beartype")
 jax.config.update("jax_default_matmul_precision", "highest")
@@ -27,7 +28,7 @@ from page_browser import browser, common, opened, opener, report, said  # noqa: 
 def tiny_prior():
     """Random weights in the smallest configuration."""
     from more2_jax.config import TrainingRun, load_config
-    from more2_jax.prior import init_prior
+    from more2_jax.network.prior import init_prior
 
     config = load_config(ROOT / "configs" / "tiny.yaml", TrainingRun).model
     return init_prior(config, jax.random.key(0), "tiny")

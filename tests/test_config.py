@@ -1,9 +1,9 @@
 """Settings: strict YAML, presets, round trips."""
 
 import dataclasses
-from pathlib import Path
 
 import pytest
+from places import ROOT
 
 from more2_jax.config import (
     MatchingConfig,
@@ -15,8 +15,6 @@ from more2_jax.config import (
     preset,
     to_yaml,
 )
-
-ROOT = Path(__file__).parents[1]
 
 
 @pytest.mark.parametrize("path", sorted((ROOT / "configs").glob("*.yaml")), ids=lambda p: p.stem)

@@ -8,8 +8,8 @@ import jsonschema
 import pytest
 from rich.console import Console
 
-from more2_jax.commands.options import Reporting
-from more2_jax.commands.session import Session
+from more2_jax.cli.options import Reporting
+from more2_jax.cli.session import Session
 from more2_jax.progress import Progress, staged
 
 SCHEMA = json.loads((resources.files("more2_jax") / "assets" / "log.schema.json").read_text(encoding="utf-8"))

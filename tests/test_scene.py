@@ -8,42 +8,15 @@ import time
 import numpy as np
 import pytest
 from factories import scene_object, turn_z
+from small_scenes import CONFIG, MARK, ROBUST, piece, scan
 
 import more2_jax.scene
-from more2_jax import registration
 from more2_jax.config import JointConfig, MeshingConfig, preset
-from more2_jax.objects import apply_pose, moved_probability, points_of
-from more2_jax.scene import add_scan, floor_under, reconstruct, start_scene
+from more2_jax.meshing.object_mesh import floor_under
+from more2_jax.registration import register as registration
+from more2_jax.scene import add_scan, reconstruct, start_scene
+from more2_jax.tracking.objects import moved_probability, points_of
 from more2_jax.types import Instance, Mesh, Scan
-
-MARK = Mesh(vertices=np.zeros((3, 3)), faces=np.array([[0, 1, 2]]))
-ROBUST = preset("robust", upright=True)
-CONFIG = dataclasses.replace(
-    ROBUST,
-    registration=dataclasses.replace(ROBUST.registration, yaw_starts=8, steps=3, icp_steps=8, keep_starts=2),
-    joint=JointConfig(points=32, start="accumulated", steps=3),
-    meshing=dataclasses.replace(ROBUST.meshing, coarse=16, resolution=16),
-)
-
-
-def piece(kind: int) -> np.ndarray:
-    """Points of a shape without symmetry: a box face set with a fin, of a size of its own."""
-    rng = np.random.default_rng(kind)
-    size = np.array([[0.8, 0.4, 0.5], [1.6, 0.7, 0.4], [0.5, 0.5, 1.4]][kind])
-    box = rng.uniform(-0.5, 0.5, (700, 3))
-    box[np.arange(700), rng.integers(0, 3, 700)] = rng.choice([-0.5, 0.5], 700)
-    fin = rng.uniform(0, 1, (200, 3)) * [0.1, 0.5, 0.9] + [0.35, 0, 0.5]
-    return np.concatenate([box, fin]) * size
-
-
-def scan(name: str, poses: dict[int, tuple[float, float]]) -> Scan:
-    """Pieces by kind, each turned by an angle and put at (x, 0); ids are 10 + kind."""
-    instances = []
-    for kind, (angle, x) in poses.items():
-        turn = turn_z(angle, np.zeros(3), np.array([x, 0.0, 0.0]))
-        instances.append(Instance(id=10 + kind, points=apply_pose(turn, piece(kind)), label=f"kind {kind}"))
-    return Scan(name=name, source=name, instances=tuple(instances))
-
 
 VISITS = (
     {0: (0.0, 0.0), 1: (0.3, 3.0)},

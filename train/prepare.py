@@ -14,13 +14,13 @@ from pathlib import Path
 
 from rich.progress import track
 
-from more2_jax.data.fan_out import Workers
-from more2_jax.data.heldout import read_ikea
-from more2_jax.data.meshes import SourceMesh, read_meshes
-from more2_jax.data.procedural import Recipe, procedural_recipes
-from more2_jax.data.shapes import Shape, make_shape
-from more2_jax.data.shards import write_shard
-from train.program import run
+from train.furniture.collections import SourceMesh, read_meshes
+from train.furniture.heldout import read_ikea
+from train.furniture.parallel_map import Workers
+from train.furniture.procedural import Recipe, procedural_recipes
+from train.run.program import run
+from train.shards.shapes import Shape, make_shape
+from train.shards.shards import write_shard
 
 SHARD = 64
 

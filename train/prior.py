@@ -25,18 +25,18 @@ from jax.sharding import Mesh
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
 from more2_jax.config import PriorConfig, TrainingConfig, TrainingRun, load_config
-from more2_jax.data.sampling import sample_batch
-from more2_jax.data.shards import Shapes
-from more2_jax.prior import Prior, encode_ordered, init_prior, load_prior, save_prior
-from train.checkpoints import keep, open_checkpoints, resume
-from train.devices import agreed, connect, device_a_core, device_mesh, everywhere, here, is_first, to_read
-from train.journal import Journal
-from train.memory import keep_freed_memory
-from train.pictures import held_out
-from train.program import run
-from train.shape_mix import load_mix
-from train.state import TrainingState, initial_state, training_step
-from train.validation import total_score, validate
+from more2_jax.network.prior import Prior, encode_ordered, init_prior, load_prior, save_prior
+from train.run.checkpoints import keep, open_checkpoints, resume
+from train.run.devices import agreed, connect, device_a_core, device_mesh, everywhere, here, is_first, to_read
+from train.run.journal import Journal
+from train.run.memory import keep_freed_memory
+from train.run.pictures import held_out
+from train.run.program import run
+from train.run.shape_mix import load_mix
+from train.run.state import TrainingState, initial_state, training_step
+from train.run.validation import total_score, validate
+from train.shards.sampling import sample_batch
+from train.shards.shards import Shapes
 
 IN_PICTURE = 6  # held-out shapes
 
@@ -70,7 +70,7 @@ def main(
 
     Args:
         config: YAML with `model` and `training`.
-        shards: folders that `python -m train.prepare` wrote, or files of `train.pack`; one that is named twice
+        shards: folders that `python -m train.prepare` wrote, or files of `train.tools.pack`; one that is named twice
             is drawn from twice as often.
         out: checkpoints, log.jsonl, curves, pictures, weights.npz (the last) and best.npz. Shared by all hosts.
         minutes: wall-clock budget.

@@ -25,12 +25,12 @@ import numpy as np
 import tyro
 from rich.progress import track
 
-from more2_jax.data.benchmark import write_scene
-from more2_jax.data.closed_models import cache_name, make_cached, read_cached, read_models
-from more2_jax.data.flying_scenes import FlyingScene, flying_scene
-from more2_jax.data.furnishing import REGIMES, Regime, furniture, scene_config
-from more2_jax.data.meshes import SourceMesh
-from train.program import run
+from train.furniture.closed_models import cache_name, make_cached, read_cached, read_models
+from train.furniture.collections import SourceMesh
+from train.rooms.regimes import REGIMES, Regime, furniture, scene_config
+from train.rooms.scene_files import write_scene
+from train.rooms.visits import FlyingScene, flying_scene
+from train.run.program import run
 
 ATTEMPTS = 4  # at furnishing a scene, before the room is called impossible
 

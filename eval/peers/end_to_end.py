@@ -9,8 +9,8 @@ import numpy as np
 from eval.peers.matching import by_registration
 from eval.peers.reconstruction import ball_pivoting
 from eval.peers.registration import many_starts
-from eval.tracks import Track
-from more2_jax.metrics import apply_pose
+from eval.scores.tracks import Track
+from more2_jax.geometry.poses import apply_pose
 from more2_jax.types import Instance, Scan
 
 NAME = "all-pairs GICP + multi-start GICP + ball pivoting"

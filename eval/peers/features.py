@@ -9,8 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from eval.peers.extra import library
-
-Points = Float[np.ndarray, "_ 3"]
+from more2_jax.geometry.poses import Points
 
 VOXEL = 0.02  # of the diagonal
 NORMAL_RADIUS, FEATURE_RADIUS = 2.5 * VOXEL, 5 * VOXEL

@@ -18,12 +18,12 @@ from jax import Array
 from jaxtyping import Float, Int
 
 from more2_jax.config import TrainingConfig
-from more2_jax.data.sampling import TrainingSample, sample_batch
-from more2_jax.data.shards import Shapes
-from more2_jax.decoder import WeightNormDense
-from more2_jax.losses import sdf_loss
-from more2_jax.prior import Prior, encode_ordered
+from more2_jax.network.decoder import WeightNormDense
+from more2_jax.network.prior import Prior, encode_ordered
 from more2_jax.types import Embedding
+from train.shards.losses import sdf_loss
+from train.shards.sampling import TrainingSample, sample_batch
+from train.shards.shards import Shapes
 
 LEAST_LENGTH = 1e-6  # of a vector that becomes an axis
 

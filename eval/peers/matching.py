@@ -12,9 +12,9 @@ from scipy.spatial.distance import cdist
 
 from eval.peers.features import fpfh
 from eval.peers.registration import all_pairs
+from more2_jax.geometry.poses import Points
 from more2_jax.types import Instance
 
-Points = Float[np.ndarray, "_ 3"]
 Matched = dict[int, int]  # instance → instance
 Matcher = Callable[[Sequence[Instance], Sequence[Instance]], Matched]
 

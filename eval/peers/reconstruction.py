@@ -15,9 +15,9 @@ from scipy.spatial import KDTree
 
 from eval.peers.extra import library
 from eval.peers.features import diagonal, open3d_cloud
+from more2_jax.geometry.poses import Points
 from more2_jax.types import Mesh
 
-Points = Float[np.ndarray, "_ 3"]
 Surfacer = Callable[[Points], Mesh | None]
 
 VOXEL = 0.008  # of the diagonal

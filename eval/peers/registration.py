@@ -18,9 +18,8 @@ from scipy.spatial.transform import Rotation
 
 from eval.peers.extra import has, library
 from eval.peers.features import VOXEL, Featured, diagonal, featured
+from more2_jax.geometry.poses import Points, Pose
 
-Points = Float[np.ndarray, "_ 3"]
-Pose = Float[np.ndarray, "4 4"]
 Registrar = Callable[[Points, Points, bool], Pose | None]
 
 YAW_STARTS = 24

@@ -10,7 +10,7 @@ from more2_jax.export.placing import pose_in
 from more2_jax.export.ply import write_ply
 from more2_jax.export.poses import write_poses
 from more2_jax.export.usd import write_usd
-from more2_jax.io import WRITTEN
+from more2_jax.storage.scene_folder import WRITTEN
 from more2_jax.types import LivingScene
 
 __all__ = ["SUFFIXES", "export_scene", "pose_in"]

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
-from more2_jax.objects import accumulated_points, observation_in, place_of
+from more2_jax.tracking.objects import accumulated_points, observation_in, place_of
 from more2_jax.types import LivingScene, SceneObject
 
 

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 
 from more2_jax.export.placing import placed
-from more2_jax.meshfile import write_points
-from more2_jax.metrics import apply_pose
-from more2_jax.objects import accumulated_points
+from more2_jax.geometry.poses import apply_pose
+from more2_jax.storage.ply_files import write_points
+from more2_jax.tracking.objects import accumulated_points
 from more2_jax.types import LivingScene
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from more2_jax.io import scene_to_json
+from more2_jax.storage.scene_folder import scene_to_json
 from more2_jax.types import LivingScene
 
 

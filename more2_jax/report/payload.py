@@ -10,8 +10,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from more2_jax.config import SceneConfig
-from more2_jax.metrics import apply_pose
-from more2_jax.objects import place_of
+from more2_jax.geometry.poses import apply_pose
 from more2_jax.report.blob import Blob
 from more2_jax.report.coverage import coverage
 from more2_jax.report.palette import color, ink
@@ -25,6 +24,7 @@ from more2_jax.report.thinning import (
     thinned,
 )
 from more2_jax.report.wording import Verdict, changes_from, doubts_of, headline, phrase, verdict
+from more2_jax.tracking.objects import place_of
 from more2_jax.types import LivingScene, Mesh, Observation, ScanRecord, SceneObject
 
 Point = Float[np.ndarray, "3"]

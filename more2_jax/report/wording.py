@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from more2_jax.config import SceneConfig
-from more2_jax.objects import changes_between, motion_between, observation_in
+from more2_jax.tracking.objects import changes_between, motion_between, observation_in
 from more2_jax.types import Changes, LivingScene, Observation, SceneObject
 
 LOW_SCORE = 0.3  # a match below it is told as unsure; same objects usually score 0.5 to 0.9

@@ -8,8 +8,8 @@ from command_line import TINY
 from factories import living_scene
 
 from more2_jax.config import preset
-from more2_jax.io import save_scene
-from more2_jax.prior import init_prior, save_prior
+from more2_jax.network.prior import init_prior, save_prior
+from more2_jax.storage.scene_folder import save_scene
 
 
 @pytest.fixture(scope="session")

@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 from command_line import refused
 
-from more2_jax.cli import main
-from more2_jax.commands import scenes
-from more2_jax.commands.session import cache_folder
+from more2_jax.cli import scenes
+from more2_jax.cli.main import main
+from more2_jax.cli.session import cache_folder
 
 SCENES = ("demo", "run", "add", "inspect", "show", "export")
 COMMANDS = (*SCENES, *(f"prior {p}" for p in ("list", "info", "import", "check")))
@@ -30,13 +30,13 @@ def test_help_has_an_example_that_parses(command, capsys, monkeypatch):
     assert example.startswith(f"Example: more2 {command}")
     called = []
     for name in ACTIONS:
-        monkeypatch.setattr(f"more2_jax.commands.{name}", lambda *a, **k: called.append(a) or 0)
+        monkeypatch.setattr(f"more2_jax.cli.{name}", lambda *a, **k: called.append(a) or 0)
     assert main(example.split()[2:]) == 0
     assert len(called) == 1
 
 
 def test_help_does_not_wait_for_jax():
-    code = "import sys, more2_jax.cli\nassert 'jax' not in sys.modules and 'trimesh' not in sys.modules"
+    code = "import sys, more2_jax.cli.main\nassert 'jax' not in sys.modules and 'trimesh' not in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True)
 
 

@@ -9,12 +9,12 @@ import pytest
 from command_line import boxes, refused, run_quickly, scan_file
 from factories import living_scene
 
-from more2_jax.cli import main
-from more2_jax.commands import building
-from more2_jax.commands.session import Session
-from more2_jax.commands.settings import scene_config
+from more2_jax.cli import living_scenes as building
+from more2_jax.cli.main import main
+from more2_jax.cli.session import Session
+from more2_jax.cli.settings import scene_config
 from more2_jax.config import preset
-from more2_jax.io import load_scene, save_scene
+from more2_jax.storage.scene_folder import load_scene, save_scene
 
 
 def bad_scan(folder: Path, kind: str) -> Path:
@@ -117,7 +117,9 @@ def test_an_occupied_folder_is_refused_before_anything_is_read(tmp_path, capsys,
 
 
 def test_scans_are_all_read_before_the_prior(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("more2_jax.prior.load_prior", lambda name: pytest.fail("the prior was loaded"))
+    monkeypatch.setattr(
+        "more2_jax.network.prior.load_prior", lambda name: pytest.fail("the prior was loaded")
+    )
     refused(capsys, "run", scan_file(tmp_path / "a.ply"), tmp_path / "none.ply", "--out", tmp_path / "room")
 
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from command_line import refused
 
-from more2_jax.cli import main
-from more2_jax.prior import load_prior
+from more2_jax.cli.main import main
+from more2_jax.network.prior import load_prior
 
 
 def test_prior_info(tiny, capsys):
@@ -21,13 +21,13 @@ def test_prior_info(tiny, capsys):
 
 def test_prior_list_names_what_is_shipped(tiny, capsys, monkeypatch):
     prior = load_prior(tiny)
-    monkeypatch.setattr("more2_jax.prior.shipped_priors", lambda: ["one", "two"])
-    monkeypatch.setattr("more2_jax.prior.load_prior", lambda name: prior)
+    monkeypatch.setattr("more2_jax.network.prior.shipped_priors", lambda: ["one", "two"])
+    monkeypatch.setattr("more2_jax.network.prior.load_prior", lambda name: prior)
     assert main(["prior", "list"]) == 0
     told = capsys.readouterr().out
     assert "one" in told
     assert "two" in told
-    monkeypatch.setattr("more2_jax.prior.shipped_priors", list)
+    monkeypatch.setattr("more2_jax.network.prior.shipped_priors", list)
     assert main(["prior", "list"]) == 0
     assert "no weights are shipped" in capsys.readouterr().out
 
@@ -55,7 +55,7 @@ def test_prior_check_passes_only_below_the_limit(monkeypatch, capsys, deviations
         "check_prior": lambda weights, arrays: asked.append(weights) or deviations,
     }
     for name, stand_in in stand_ins.items():
-        monkeypatch.setattr(f"more2_jax.checkpoint.{name}", stand_in)
+        monkeypatch.setattr(f"more2_jax.network.torch_checkpoint.{name}", stand_in)
     files = ["reference.npz"] if alone else ["published.pt", "reference.npz"]
     assert main(["prior", "check", *files]) == code
     assert asked == ["reference.npz", inside if alone else outside]
@@ -66,8 +66,8 @@ def test_prior_check_passes_only_below_the_limit(monkeypatch, capsys, deviations
 def test_prior_import_writes_full_precision_once(tmp_path, tiny, monkeypatch, capsys):
     half = load_prior(tiny)
     exact = dataclasses.replace(half, params=jax.tree.map(lambda v: v / 3, half.params))
-    monkeypatch.setattr("more2_jax.checkpoint.read_checkpoint", lambda path: {"read": path})
-    converted = "more2_jax.published.prior_from_published"
+    monkeypatch.setattr("more2_jax.network.torch_checkpoint.read_checkpoint", lambda path: {"read": path})
+    converted = "more2_jax.network.published_weights.prior_from_published"
     monkeypatch.setattr(converted, lambda weights, name: dataclasses.replace(exact, name=name))
     out = tmp_path / "deep/mine.npz"
     assert main(["prior", "import", "published.pt", str(out)]) == 0

@@ -11,17 +11,17 @@ from pathlib import Path
 import pytest
 from command_line import QUICK, boxes, heed_interrupts, refused, run_quickly, scan_file
 
-from more2_jax.cli import main
-from more2_jax.commands import building
-from more2_jax.io import load_scene
-from more2_jax.prior import load_prior, save_prior
+from more2_jax.cli import living_scenes as building
+from more2_jax.cli.main import main
+from more2_jax.network.prior import load_prior, save_prior
+from more2_jax.storage.scene_folder import load_scene
 
 POSIX = pytest.mark.skipif(os.name != "posix", reason="sends signals")
 # Stops at a named place, says so, and waits there to be sent a signal.
 STOPPING = """
 import sys, time
-import more2_jax.scene, more2_jax.io
-from more2_jax.cli import main
+import more2_jax.scene, more2_jax.storage.scene_folder, more2_jax.meshing.object_mesh
+from more2_jax.cli.main import main
 
 def stop(module, name, nth):
     real, calls = getattr(module, name), [0]
@@ -34,8 +34,8 @@ def stop(module, name, nth):
     setattr(module, name, wrapped)
 
 place, nth = sys.argv[1], int(sys.argv[2])
-module = {"add_scan": more2_jax.scene, "reconstruct": more2_jax.scene, "mesh_of": more2_jax.scene}
-stop(module.get(place, more2_jax.io), place, nth)
+module = {"add_scan": more2_jax.scene, "reconstruct": more2_jax.scene, "mesh_of": more2_jax.meshing.object_mesh}
+stop(module.get(place, more2_jax.storage.scene_folder), place, nth)
 sys.exit(main(sys.argv[3:]))
 """
 
@@ -179,7 +179,7 @@ def test_masks_and_depth_frames_reach_the_reader_in_order(tmp_path, three, capsy
         if len(asked) == 2:
             raise ValueError("enough")
 
-    monkeypatch.setattr("more2_jax.data.scans.read_scan", read_scan)
+    monkeypatch.setattr("more2_jax.scans.read_scan.read_scan", read_scan)
     monkeypatch.setattr(
         building,
         "read",
@@ -200,7 +200,7 @@ def test_inspect_and_add_take_masks(tmp_path, stored, three, capsys, monkeypatch
         asked.append(options)
         raise ValueError("enough")
 
-    monkeypatch.setattr("more2_jax.data.scans.read_scan", read_scan)
+    monkeypatch.setattr("more2_jax.scans.read_scan.read_scan", read_scan)
     options = ["--masks", tmp_path / "m", "--unit", "mm", "--depth-frames"]
     refused(capsys, "inspect", three[0], *options)
     refused(capsys, "add", stored, three[0], *options)

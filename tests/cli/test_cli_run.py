@@ -12,10 +12,10 @@ from command_line import boxes, heed_interrupts, run_quickly, scan_file
 from factories import living_scene
 from rich.table import Table
 
-from more2_jax.cli import main
-from more2_jax.commands import building
+from more2_jax.cli import living_scenes as building
+from more2_jax.cli.main import main
 from more2_jax.config import preset
-from more2_jax.io import load_scene, save_scene
+from more2_jax.storage.scene_folder import load_scene, save_scene
 
 
 def test_run_then_add(tmp_path, tiny, capsys):
@@ -48,7 +48,7 @@ def test_demo_runs_on_the_bundled_scans_and_ends_with_the_truth(tmp_path, capsys
     asked = []
     monkeypatch.setattr(building, "run_scans", lambda *args, **_: asked.append(args) or living_scene())
     monkeypatch.setattr(
-        "more2_jax.demo.demo_table", lambda scene: (Table("truth"), f"{len(scene.objects)} right")
+        "more2_jax.cli.demo_score.demo_table", lambda scene: (Table("truth"), f"{len(scene.objects)} right")
     )
     monkeypatch.chdir(tmp_path)
     assert main(["demo"]) == 0
@@ -81,7 +81,7 @@ def test_ctrl_c_while_writing_leaves_the_old_scene(tmp_path, stored, monkeypatch
     def interrupted(*args):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("more2_jax.io.write_report", interrupted)
+    monkeypatch.setattr("more2_jax.storage.scene_folder.write_report", interrupted)
     with pytest.raises(KeyboardInterrupt):
         save_scene(dataclasses.replace(living_scene(), prior="newer"), stored, preset("robust"))
     assert load_scene(stored)[0].prior == "small"
@@ -91,7 +91,7 @@ def test_ctrl_c_while_writing_leaves_the_old_scene(tmp_path, stored, monkeypatch
 @pytest.mark.skipif(os.name != "posix", reason="sends SIGINT")
 def test_sigint_to_the_process_exits_with_130(tmp_path, tiny):
     code = (
-        "import sys, time, more2_jax.commands.building as s; from more2_jax.cli import main\n"
+        "import sys, time, more2_jax.cli.living_scenes as s; from more2_jax.cli.main import main\n"
         "s.read = lambda *a: (print('waiting', flush=True), time.sleep(60))\n"
         "sys.exit(main(sys.argv[1:]))"
     )

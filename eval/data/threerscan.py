@@ -1,0 +1,127 @@
+"""3RScan as a benchmark (METHOD 8): places of a split, the true associations, ambiguity chains, predicted masks.
+
+`<data>/3RScan.json`, or beside the folder of scans; `<data>/<scan>/…` as published. An object's model frame is the
+frame of the reference scan; that of objects which look alike, the pose of the one with the smallest id.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+
+from eval.data.masks import associated
+from eval.data.truth import Benchmark, KnownObject, KnownScene
+from more2_jax.geometry.poses import apply_pose, rotation_error_deg
+from more2_jax.scans.read_scan import read_scan
+from more2_jax.scans.threerscan_index import CATEGORIES, SYMMETRY_FOLDS, Place, Rescan, read_index
+from more2_jax.storage.ply_files import read_mesh
+from more2_jax.types import Mesh, Scan
+from train.furniture.symmetry import SymmetryGroup
+
+RIGHT_DEG = 10.0
+MOVED_DEG, MOVED_M = 1.0, 0.05  # beyond either, an object moved (published evaluation)
+FORGIVEN_DEG = {0: (), 1: (180.0,), 2: (90.0, 180.0)}  # by the published evaluation, by class of symmetry
+
+
+def threerscan(data: Path, *, split: str, predicted: bool) -> Benchmark:
+    """The places of a split that are on disk. Raises ValueError if 3RScan.json is missing or no place is left."""
+    index = next((p for p in (data / "3RScan.json", data.parent / "3RScan.json") if p.is_file()), None)
+    if index is None:
+        raise ValueError(f"{data}: no 3RScan.json in it or beside it; needed the data set's index")
+    places = {p.reference: p for p in read_index(index, data, split).places if p.rescans}
+    if not places:
+        raise ValueError(f"{data}: no place of split {split} with a rescan; needed one")
+    return Benchmark(
+        names=tuple(sorted(places)),
+        read=lambda name: read_place(data, places[name], predicted=predicted),
+        facts={"dataset": "3RScan", "regime": split, "masks": "predicted" if predicted else "annotated"},
+        upright=True,
+        right_deg=RIGHT_DEG,
+    )
+
+
+def read_place(data: Path, place: Place, *, predicted: bool = False) -> KnownScene:
+    """One place: the reference scan first, rescans in the file's order; movable categories only.
+
+    `predicted` looks through predicted masks instead; each object is shown by the mask that overlaps it most.
+    """
+    folders = [data / name for name in (place.reference, *(r.id for r in place.rescans))]
+    scans = [movable(folder) for folder in folders]
+    labels = [{i.id: i.label or "" for i in scan.instances} for scan in scans]
+    objects = tuple(_object(data, place, i, labels, scans[0]) for i in sorted(labels[0]))
+    scene = KnownScene(name=place.reference, scans=tuple(scans), objects=objects)
+    return associated(scene, [read_predicted(folder) for folder in folders]) if predicted else scene
+
+
+def true_mesh(data: Path, place: Place, id_: int, T_ref_model: np.ndarray) -> Mesh | None:
+    """The object's annotated surface, in its model frame, where the data have it: the published evaluation's files."""
+    file = data.parent / "val_set_recon" / place.reference / f"objectId_{id_}.ply"
+    if not file.is_file():
+        return None
+    mesh = read_mesh(file)
+    return Mesh(
+        vertices=apply_pose(np.linalg.inv(T_ref_model), mesh.vertices), faces=mesh.faces.astype(np.int64)
+    )
+
+
+def movable(folder: Path) -> Scan:
+    """A scan with its annotated instances of movable categories."""
+    scan = read_scan(folder, min_points=1)
+    kept = tuple(i for i in scan.instances if i.label in CATEGORIES)
+    return dataclasses.replace(scan, instances=kept)
+
+
+def read_predicted(folder: Path) -> Scan:
+    """A scan with all its predicted instances. Raises ValueError if there is no file of masks."""
+    files = [folder / "mask3d.labels.npz", folder / f"{folder.name}.txt", folder / f"{folder.name}.npz"]
+    masks = next((f for f in files if f.is_file()), None)
+    if masks is None:
+        raise ValueError(f"{folder}: no predicted masks; needed {', '.join(f.name for f in files)}")
+    return read_scan(folder, min_points=1, masks=masks)
+
+
+def _object(data: Path, place: Place, id_: int, labels: list[dict[int, str]], reference: Scan) -> KnownObject:
+    """An object of the reference, with what is annotated of it in every rescan."""
+    root, T_ref_model = _model_frame(place, id_)
+    poses, instance, moved = {0: T_ref_model}, {0: id_}, {0: False}
+    symmetry = 0
+    for k, rescan in enumerate(place.rescans, start=1):
+        found = [i for i in labels[k] if rescan.instance_in_reference(i) == id_]
+        if not found or id_ in rescan.removed or found[0] in rescan.nonrigid:
+            continue
+        instance[k] = found[0]
+        poses[k] = np.linalg.inv(rescan.pose_of(found[0])) @ T_ref_model
+        moved[k] = has_moved(rescan, found[0])
+        symmetry = max(symmetry, next((m.symmetry for m in rescan.moved if m.instance_ref == id_), 0))
+    center = _center(reference, id_, T_ref_model)
+    return KnownObject(
+        name=f"instance_{id_}",
+        category=labels[0][id_],
+        copies=f"instance_{root}",
+        instance=instance,
+        T_scan_model=poses,
+        mesh=true_mesh(data, place, id_, T_ref_model),
+        symmetry=SymmetryGroup.turns(SYMMETRY_FOLDS.get(symmetry, 1), center),
+        forgiven_deg=FORGIVEN_DEG.get(symmetry, ()),
+        moved=moved,
+    )
+
+
+def _model_frame(place: Place, id_: int) -> tuple[int, np.ndarray]:
+    """The one of the objects that look alike whose pose is the model frame, and the pose from it onto this one."""
+    root = min(place.interchangeable(id_))
+    return root, place.interchangeable(root)[id_]
+
+
+def _center(reference: Scan, id_: int, T_ref_model: np.ndarray) -> np.ndarray:
+    points = next((i.points for i in reference.instances if i.id == id_), np.zeros((1, 3)))
+    box = np.stack([points.min(axis=0), points.max(axis=0)]).mean(axis=0, keepdims=True)
+    return apply_pose(np.linalg.inv(T_ref_model), box)[0]
+
+
+def has_moved(rescan: Rescan, instance: int) -> bool:
+    """Whether the annotated pose differs from that of what did not move."""
+    T = np.linalg.inv(rescan.T_ref_rescan) @ rescan.pose_of(instance)
+    return rotation_error_deg(T[:3, :3], np.eye(3)) > MOVED_DEG or float(np.linalg.norm(T[:3, 3])) > MOVED_M

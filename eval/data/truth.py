@@ -1,0 +1,87 @@
+"""What is true of a benchmark's scenes, in one form for every data set."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from more2_jax.geometry.poses import Pose
+from more2_jax.types import Instance, Mesh, Scan
+from train.furniture.symmetry import SymmetryGroup
+
+
+@dataclass(frozen=True, kw_only=True)
+class KnownObject:
+    """One object over all scans. The keys of `instance` and `T_scan_model` are the scans that have it.
+
+    Objects with the same `copies` look alike and share a model frame, so each may stand in for the other.
+    """
+
+    name: str
+    category: str
+    copies: str
+    instance: dict[int, int]
+    T_scan_model: dict[int, Pose]
+    symmetry: SymmetryGroup
+    mesh: Mesh | None = None  # closed, model frame; None where the data set has none
+    forgiven_deg: tuple[float, ...] = (90.0, 180.0)  # by the published evaluation
+    moved: dict[int, bool] = field(default_factory=dict)  # since the first scan; absent: not known
+    canonical: float = 1.0  # canonical units a metre
+
+    @property
+    def first(self) -> int:
+        """The scan in which it is seen first."""
+        return min(self.instance)
+
+    def true_pose(self, other: KnownObject, scan: int, ref: int) -> Pose:
+        """`T_ref_scan` that lays `other` (itself, or a copy) as scan `scan` saw it onto this one in scan `ref`."""
+        return self.T_scan_model[ref] @ np.linalg.inv(other.T_scan_model[scan])
+
+
+@dataclass(frozen=True, kw_only=True)
+class KnownScene:
+    """Scans of one place and the truth about them."""
+
+    name: str
+    scans: tuple[Scan, ...]
+    objects: tuple[KnownObject, ...]
+    facts: dict[str, Any] = field(default_factory=dict)
+
+    def first_scans(self, count: int) -> KnownScene:
+        """The scene as if only its first scans had been made; 0 for all."""
+        if not count or count >= len(self.scans):
+            return self
+        objects = [
+            replace(
+                o,
+                instance={k: i for k, i in o.instance.items() if k < count},
+                T_scan_model={k: T for k, T in o.T_scan_model.items() if k < count},
+            )
+            for o in self.objects
+        ]
+        return replace(self, scans=self.scans[:count], objects=tuple(o for o in objects if o.instance))
+
+    def owner(self, scan: int, instance: int) -> KnownObject | None:
+        """The object that an instance of a scan shows."""
+        return next((o for o in self.objects if o.instance.get(scan) == instance), None)
+
+    def instance(self, scan: int, id_: int) -> Instance:
+        """An instance by its id; KeyError if the scan has none of it."""
+        found = next((i for i in self.scans[scan].instances if i.id == id_), None)
+        if found is None:
+            raise KeyError(f"scan {scan} of {self.name} has no instance {id_}")
+        return found
+
+
+@dataclass(frozen=True, kw_only=True)
+class Benchmark:
+    """Scenes by name, read one at a time."""
+
+    names: tuple[str, ...]
+    read: Callable[[str], KnownScene]
+    facts: dict[str, Any]  # data set, regime, version: what a result belongs to
+    upright: bool  # objects only turn about the vertical
+    right_deg: float  # a rotation error below it is a success (METHOD 9)

@@ -1,0 +1,87 @@
+"""What every program of this folder is told."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from eval.data.flyingshape import flyingshape
+from eval.data.threerscan import threerscan
+from eval.data.truth import Benchmark, KnownScene
+
+Masks = Literal["true", "merged", "split", "eroded", "wrong", "predicted"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options:
+    """Which data, which settings, and where results go."""
+
+    data: Path
+    """Folder of the data set."""
+    out: Path
+    """Folder of the results; a stopped run resumes there."""
+    dataset: Literal["flyingshape", "3rscan"] = "flyingshape"
+    """flyingshape: written by train.synthesise, or the published npz files."""
+    preset: Literal["paper", "robust"] = "robust"
+    """Settings of the method."""
+    prior: str = "small"
+    """Name of shipped weights, or a file."""
+    scenes: int = 0
+    """How many, from the first; 0 for all."""
+    visits: int = 0
+    """How many scans of each scene, from the first; 0 for all."""
+    masks: Masks = "true"
+    """true, damaged on purpose, or (3rscan) predicted: mask3d.labels.npz beside each scan."""
+    upright: Literal["auto", "yes", "no"] = "auto"
+    """Whether the method is told that objects only turn about the vertical; auto: as the data were made."""
+    sensors: bool = True
+    """Whether the method is told where the sensors of every scan stood, where the data say so. Peers never ask."""
+    peers: bool = True
+    """Also measure what one would use instead, on the same clouds."""
+    chunk: int = 4
+    """Scenes that share a batch."""
+    batch: int = 16
+    """Clouds or pairs a compiled call takes; shared by all devices."""
+    at_once: int = 1
+    """Scenes that a device works on at the same time, where whole scenes are its unit: one for every core keeps a
+    CPU busy. Times of a scene then include waiting for the others."""
+    split: Literal["train", "validation", "test"] = "validation"
+    """Of 3rscan."""
+    fresh: bool = False
+    """Forget an earlier run in `out` if its settings, weights or data are others."""
+    distributed: bool = False
+    """Several hosts, each with its share of the scenes: jax.distributed, set up by the cluster."""
+
+
+def benchmark(o: Options) -> Benchmark:
+    """The data. Raises ValueError if there are none of that kind, or the masks are not to be had."""
+    if not o.data.is_dir():
+        raise ValueError(f"{o.data}: no such folder")
+    if o.scenes < 0 or o.visits < 0 or o.visits == 1 or min(o.chunk, o.batch, o.at_once) < 1:
+        raise ValueError(
+            f"scenes {o.scenes}, visits {o.visits}, chunk {o.chunk}, batch {o.batch}, at once {o.at_once}; needed 0"
+            " (all) or more, two visits at least, positive chunk, batch and number at once"
+        )
+    if o.masks == "predicted" and o.dataset != "3rscan":
+        raise ValueError(
+            "predicted masks are read for 3rscan only; damaged ones are merged, split, eroded, wrong"
+        )
+    data = (
+        threerscan(o.data, split=o.split, predicted=o.masks == "predicted")
+        if o.dataset == "3rscan"
+        else flyingshape(o.data)
+    )
+    return data if o.sensors else replace(data, read=lambda name: without_sensors(data.read(name)))
+
+
+def without_sensors(scene: KnownScene) -> KnownScene:
+    """The scene as if nobody knew where its sensors stood."""
+    return replace(scene, scans=tuple(replace(s, sensors=np.zeros((0, 3))) for s in scene.scans))
+
+
+def is_upright(o: Options, data: Benchmark) -> bool:
+    """What the method is told."""
+    return data.upright if o.upright == "auto" else o.upright == "yes"

@@ -1,0 +1,117 @@
+"""What a method says of a whole scene, in one form: which instances are one object, where, and its surface."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from eval.data.masks import LOST
+from eval.data.truth import KnownObject, KnownScene, Pose
+from eval.scores.figures import COLUMNS, Record
+from eval.scores.mesh_scores import RECONSTRUCTED, mesh_scores
+from eval.scores.pose_scores import failed_pose, pose_scores
+from more2_jax.metrics import f1
+from more2_jax.tracking.objects import accumulated_points
+from more2_jax.types import LivingScene, Mesh
+
+
+@dataclass(frozen=True, kw_only=True)
+class Track:
+    """One object over all scans: its instance in each, `T_track_scan`, its points and its mesh (frame of the track)."""
+
+    instance: dict[int, int]
+    T_track_scan: dict[int, Pose]
+    points: Float[np.ndarray, "n 3"]
+    mesh: Mesh | None = None
+
+
+def tracks_of(scene: LivingScene) -> list[Track]:
+    """The objects of a living scene."""
+    return [
+        Track(
+            instance={seen.scan: seen.instance for seen in o.observations},
+            T_track_scan={seen.scan: seen.T_ref_scan for seen in o.observations},
+            points=accumulated_points(o),
+            mesh=o.mesh,
+        )
+        for o in scene.objects
+    ]
+
+
+def track_with(tracks: Sequence[Track], scan: int, instance: int) -> Track | None:
+    """The track that holds an instance."""
+    return next((t for t in tracks if t.instance.get(scan) == instance), None)
+
+
+def score_tracks(scene: KnownScene, tracks: Sequence[Track], right_deg: float, samples: int) -> list[Record]:
+    """A record for every true pair (first scan that has an object, each later one): matched, registered, reconstructed.
+
+    As published, objects without a mask do not count at all; in the other columns they have failed.
+    """
+    records = []
+    for o in scene.objects:
+        track = track_with(tracks, o.first, o.instance[o.first]) if o.instance[o.first] != LOST else None
+        recalled = object_recall(o, track, samples) if o.mesh is not None else None
+        for k in sorted(o.instance):
+            if k > o.first:
+                lost = LOST in (o.instance[o.first], o.instance[k])
+                records.append(pair_record(scene, o, k, track, right_deg, recalled, lost=lost))
+    return records
+
+
+def pair_record(
+    scene: KnownScene,
+    o: KnownObject,
+    k: int,
+    track: Track | None,
+    right_deg: float,
+    recalled: dict[str, float] | None,
+    *,
+    lost: bool,
+) -> Record:
+    """One true pair. `mr.*` and `mrr.*` are 1 or 0; the latter only where there is a true mesh."""
+    found = track.instance.get(k) if track else None
+    other = scene.owner(k, found) if found is not None else None
+    scores = failed_pose()
+    if track is not None and other is not None and other.copies == o.copies and not lost:
+        T = np.linalg.inv(track.T_track_scan[o.first]) @ track.T_track_scan[k]
+        clouds = (
+            scene.instance(k, other.instance[k]).points,
+            scene.instance(o.first, o.instance[o.first]).points,
+        )
+        scores = pose_scores(T, o, other, k, o.first, *clouds)
+    record: Record = {"object": o.name, "category": o.category, "to_scan": k, **scores}
+    for c in COLUMNS:
+        if c == "published" and lost:
+            continue
+        same = other is o if c == "paper" else other is not None and other.copies == o.copies
+        error = scores[f"re_deg.{c}"]
+        record[f"m.{c}"] = float(same)
+        record[f"mr.{c}"] = float(same and error is not None and error < right_deg)
+        if recalled is not None:
+            record[f"mrr.{c}"] = record[f"mr.{c}"] * float(recalled[c] > RECONSTRUCTED)
+    return record
+
+
+def object_recall(o: KnownObject, track: Track | None, samples: int) -> dict[str, float]:
+    """SDF recall of the object's mesh in each column; 0 without one."""
+    if track is None:
+        return dict.fromkeys(COLUMNS, 0.0)
+    scores = mesh_scores(track.mesh, o, track.T_track_scan[o.first] @ o.T_scan_model[o.first], samples)
+    return {str(c): float(scores[f"recall.{c}"] or 0.0) for c in COLUMNS}
+
+
+def changes_f1(scene: KnownScene, tracks: Sequence[Track]) -> float:
+    """F1 of added and removed between scans that follow each other: instances that begin or end a presence."""
+    said, true = set[str](), set[str]()
+    for k in range(1, len(scene.scans)):
+        for presence, found in (
+            ([t.instance for t in tracks], said),
+            ([o.instance for o in scene.objects], true),
+        ):
+            found |= {f"added {k} {p[k]}" for p in presence if k in p and k - 1 not in p}
+            found |= {f"removed {k} {p[k - 1]}" for p in presence if k - 1 in p and k not in p}
+    return f1(said, true)

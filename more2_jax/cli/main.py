@@ -1,0 +1,297 @@
+"""`more2 …`: the command line. Exit codes: 0 done, 2 bad input, 1 failure, 130 interrupted."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+from tyro.conf import OmitArgPrefixes, OmitSubcommandPrefixes, Positional, arg, subcommand
+
+from more2_jax.cli import living_scenes as building
+from more2_jax.cli import priors, scenes
+from more2_jax.cli.options import Reading, Reporting
+from more2_jax.cli.session import one_line
+from more2_jax.cli.settings import scene_config
+
+PresetName = Literal["robust", "paper"]
+BAD_INPUT = (ValueError, FileNotFoundError, PermissionError, IsADirectoryError, NotADirectoryError)
+
+
+@dataclass(frozen=True)
+class Demo:
+    """The whole job on the bundled scans with the bundled prior, held against the ground truth.
+
+    Example: more2 demo --out demo_scene
+    """
+
+    out: Path = Path("demo_scene")
+    """Folder of the living scene, saved after every scan; new, empty, or a living scene to replace."""
+    preset: PresetName = "robust"
+    """robust: several starts a pair. paper: the method to the letter."""
+    upright: bool = True
+    """Objects turn about the vertical (z) only."""
+    prior: str = "small"
+    """Name of shipped weights, or a file."""
+    resume: bool = False
+    """Go on with the same command after an interruption: keep the scans already in the folder."""
+    reporting: Reporting = field(default_factory=Reporting)
+
+    def __call__(self) -> int:
+        config = scene_config(self.preset, self.upright, None)
+        building.demo(self.out, config, self.prior, resume=self.resume, reporting=self.reporting)
+        return 0
+
+
+@dataclass(frozen=True)
+class Run:
+    """A living scene from scans in time order. One scan is reconstructed; more are compared.
+
+    Example: more2 run monday.ply friday.ply --out my_room --upright
+    """
+
+    scans: Annotated[Positional[tuple[Path, ...]], arg(metavar="SCAN [SCAN ...]")]
+    """PLY with an integer property naming the instance, NPZ, or a folder of one PLY per object."""
+    out: Path
+    """Folder of the living scene, saved after every scan; new, empty, or a living scene to replace."""
+    preset: PresetName = "robust"
+    """robust: several starts a pair. paper: the method to the letter."""
+    upright: bool = False
+    """Objects turn about the vertical (z) only."""
+    prior: str = "small"
+    """Name of shipped weights, or a file."""
+    masks: tuple[Path, ...] = ()
+    """Predicted masks (Mask3D) beside scans without their own: none, or one a scan in the same order."""
+    reading: Reading = field(default_factory=Reading)
+    config: Path | None = None
+    """YAML with values that replace the preset's."""
+    resume: bool = False
+    """Go on with the same command after an interruption: keep the scans already in the folder."""
+    reporting: Reporting = field(default_factory=Reporting)
+
+    def __call__(self) -> int:
+        config = scene_config(self.preset, self.upright, self.config)
+        building.run_scans(
+            self.scans,
+            self.out,
+            config,
+            self.prior,
+            reading=self.reading,
+            masks=self.masks,
+            resume=self.resume,
+            reporting=self.reporting,
+        )
+        return 0
+
+
+@dataclass(frozen=True)
+class Add:
+    """One more scan into a stored living scene, without redoing the others.
+
+    Example: more2 add my_room sunday.ply
+    """
+
+    folder: Positional[Path]
+    """The living scene."""
+    scan: Positional[Path]
+    """The scan to add, later than all others."""
+    prior: str | None = None
+    """The weights the scene was made with, where they are not shipped."""
+    masks: Path | None = None
+    """Predicted masks (Mask3D) beside a scan without its own."""
+    reading: Reading = field(default_factory=Reading)
+    reporting: Reporting = field(default_factory=Reporting)
+
+    def __call__(self) -> int:
+        building.add(
+            self.folder,
+            self.scan,
+            self.prior,
+            reading=self.reading,
+            masks=self.masks,
+            reporting=self.reporting,
+        )
+        return 0
+
+
+@dataclass(frozen=True)
+class Inspect:
+    """What a scan holds: instances, points, extents, likely unit and up axis, what was ignored and why.
+
+    Example: more2 inspect monday.ply
+    """
+
+    scan: Positional[Path]
+    """PLY, NPZ, or a folder of one PLY per object."""
+    masks: Path | None = None
+    """Predicted masks (Mask3D) beside a scan without its own."""
+    reading: Reading = field(default_factory=Reading)
+    min_points: int = 64
+    """Objects of fewer points are left out."""
+
+    def __call__(self) -> int:
+        scenes.inspect(self.scan, self.reading, self.masks, self.min_points)
+        return 0
+
+
+@dataclass(frozen=True)
+class Show:
+    """Path of the page of a living scene; with a display, opens it. Or serves it, to this machine only.
+
+    Example: more2 show my_room --serve
+    """
+
+    folder: Positional[Path]
+    """The living scene."""
+    open: bool = True
+    """Open the page where there is a display."""
+    serve: bool = False
+    """Serve the page and the exports at 127.0.0.1 until ctrl-C."""
+    port: int = 0
+    """With serve: the port; 0 takes a free one."""
+
+    def __call__(self) -> int:
+        if self.port and not self.serve:
+            raise ValueError(f"--port {self.port} without --serve; needed both, or neither")
+        scenes.show(self.folder, self.open, self.serve, self.port)
+        return 0
+
+
+@dataclass(frozen=True)
+class Export:
+    """A living scene as one file for other tools.
+
+    Example: more2 export my_room --format glb --scan 0
+    """
+
+    folder: Positional[Path]
+    """The living scene."""
+    format: Literal["glb", "usd", "ply", "json"]
+    """glb: meshes, animated over the scans, y up. usd: the same as time samples. ply: points of one scan. json:
+    poses and changes."""
+    out: Path | None = None
+    """File or folder to write to; by default a file beside the living scene's folder."""
+    scan: int = -1
+    """The scan shown by ply, and by glb at rest, from 0; -1 is the last."""
+
+    def __call__(self) -> int:
+        scenes.export(self.folder, self.format, self.out, self.scan)
+        return 0
+
+
+@dataclass(frozen=True)
+class PriorList:
+    """The weights inside the package.
+
+    Example: more2 prior list
+    """
+
+    def __call__(self) -> int:
+        priors.list_shipped()
+        return 0
+
+
+@dataclass(frozen=True)
+class PriorInfo:
+    """What a weight file holds.
+
+    Example: more2 prior info small
+    """
+
+    name: Positional[str]
+    """Name of shipped weights, or a file."""
+
+    def __call__(self) -> int:
+        priors.info(self.name)
+        return 0
+
+
+@dataclass(frozen=True)
+class PriorImport:
+    """The published PyTorch checkpoint converted, in full precision; runs no code from the file.
+
+    Example: more2 prior import published.pt published.npz
+    """
+
+    checkpoint: Positional[Path]
+    """A checkpoint with the published names under model_state_dict."""
+    out: Positional[Path]
+    """The weight file to write; a new .npz."""
+
+    def __call__(self) -> int:
+        priors.import_published(self.checkpoint, self.out)
+        return 0
+
+
+@dataclass(frozen=True)
+class PriorCheck:
+    """Largest deviations of converted weights from a reference's outputs; exit 0 only if all are below 1e-5.
+
+    Example: more2 prior check published.pt reference.npz
+    """
+
+    checkpoint: Positional[Path]
+    """A checkpoint; or, alone, a reference that holds the weights too."""
+    reference: Positional[Path | None] = None
+    """NPZ of points, queries, F_inv, F_eqv, F_s, F_c and sdf."""
+
+    def __call__(self) -> int:
+        return priors.check(self.checkpoint, self.reference)
+
+
+@dataclass(frozen=True)
+class PriorCommand:
+    """Weights: shipped, the published checkpoint converted, your own.
+
+    Example: more2 prior list
+    """
+
+    action: OmitSubcommandPrefixes[
+        Annotated[PriorList, subcommand("list")]
+        | Annotated[PriorInfo, subcommand("info")]
+        | Annotated[PriorImport, subcommand("import")]
+        | Annotated[PriorCheck, subcommand("check")]
+    ]
+
+    def __call__(self) -> int:
+        return self.action()
+
+
+Command = (
+    Annotated[Demo, subcommand("demo")]
+    | Annotated[Run, subcommand("run")]
+    | Annotated[Add, subcommand("add")]
+    | Annotated[Inspect, subcommand("inspect")]
+    | Annotated[Show, subcommand("show")]
+    | Annotated[Export, subcommand("export")]
+    | Annotated[PriorCommand, subcommand("prior")]
+)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Runs one command; returns the exit code. Unforeseen exceptions pass through, with their traceback."""
+    command = tyro.cli(
+        Command,  # type: ignore[arg-type]
+        args=argv,
+        prog="more2",
+        description="Living scenes: objects found again and reconstructed over scans of one place.",
+        config=(OmitArgPrefixes,),
+    )
+    try:
+        return command()
+    except BAD_INPUT as error:
+        print(f"error: {one_line(error)}", file=sys.stderr)
+        return 2
+    except OSError as error:
+        print(f"error: {one_line(error)}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt as error:
+        print(f"interrupted; {error}" if error.args else "interrupted", file=sys.stderr)
+        return 130
+
+
+if __name__ == "__main__":
+    sys.exit(main())

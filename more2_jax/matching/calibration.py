@@ -1,0 +1,100 @@
+"""TODO"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from more2_jax.config import RegistrationConfig
+from more2_jax.matching.pair_evidence import Evidence, asks_prior
+from more2_jax.registration.surface import (
+    LIFTED,
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Compared:
+    """What is known of pairs without aligning them."""
+
+    size: Float[np.ndarray, "*pairs"]  # |log| of the ratio of the F_s
+    likeness: Float[np.ndarray, "*pairs"]  # cosine of the F_inv
+    top_m: Float[np.ndarray, "*pairs"]  # difference of the heights of their highest points
+    color: Float[np.ndarray, "*pairs"]  # log likelihood ratio of their colours (`color.color_evidence`)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Calibration:
+    """Log odds that two clouds show one object, linear in what is known of the pair (docs/relocalisation.md)."""
+
+    intercept: float
+    nearer: float  # of the smaller mean truncated distance of the two ways,
+    farther: float  # and of the larger
+    size: float
+    likeness: float
+    lift: float = 0.0  # of a change of height, in shares of `LIFTED` of the radius, at most 1
+    top: float = 0.0  # of `top_m`, in shares of the radius, at most `HIGHEST`
+    off_less: float = 0.0  # of the smaller distance off the other's completed surface,
+    off_more: float = 0.0  # and of the larger
+
+
+HIGHEST = 0.2
+
+
+UNKNOWN = 0.5  # of `off_own`: a prior that lays a cloud so far off its own surface has no say
+
+
+# Logistic regression on pairs of validation rooms; how, and how well it holds, is in docs/relocalisation.md.
+UPRIGHT = Calibration(intercept=3.7, nearer=-6.9, farther=-1.0, size=-2.7, likeness=2.6, lift=-2.5, top=-21.0)
+
+
+FREE = Calibration(
+    intercept=2.6, nearer=-6.9, farther=0.0, size=-4.0, likeness=7.25, off_less=-11.1, off_more=-6.5
+)
+
+
+# Without the prior's say.
+UNASKED = Calibration(intercept=1.2, nearer=-9.9, farther=-3.3, size=-4.2, likeness=5.7)
+
+
+def calibrated(
+    evidence: Evidence, compared: Compared, config: RegistrationConfig, upright: bool
+) -> Float[np.ndarray, "*pairs"]:
+    """`log_odds` as these settings were calibrated; `upright`: things stand on the floor of one frame.
+
+    Weights that know nothing of a pair's clouds have no say in it."""
+    if upright:
+        return log_odds(evidence, compared, UPRIGHT)
+    unasked = log_odds(evidence, compared, UNASKED)
+    if not asks_prior(config, upright):
+        return unasked
+    return np.where(np.asarray(evidence.off_own) <= UNKNOWN, log_odds(evidence, compared, FREE), unasked)
+
+
+def log_odds(evidence: Evidence, compared: Compared, c: Calibration) -> Float[np.ndarray, "*pairs"]:
+    """Of every pair to be one object."""
+    return weighed(features(evidence, compared), c) + compared.color
+
+
+def weighed(known: dict[str, Float[np.ndarray, "*pairs"]], c: Calibration) -> Float[np.ndarray, "*pairs"]:
+    """Log odds of what is known (`features`) by a calibration; without colours."""
+    parts = [getattr(c, name) * value for name, value in known.items()]
+    return c.intercept + np.sum(parts, axis=0)
+
+
+def features(evidence: Evidence, compared: Compared) -> dict[str, Float[np.ndarray, "*pairs"]]:
+    """What each weight of a `Calibration` is multiplied with, by its name."""
+    radius = np.asarray(evidence.radius)
+    ways = np.stack([evidence.of_source, evidence.of_target])
+    off = np.stack([evidence.off_source, evidence.off_target])
+    return {
+        "nearer": ways.min(axis=0),
+        "farther": ways.max(axis=0),
+        "size": compared.size,
+        "likeness": compared.likeness,
+        "lift": np.minimum(np.asarray(evidence.lift) / (LIFTED * radius), 1.0),
+        "top": np.minimum(compared.top_m / radius, HIGHEST),
+        "off_less": off.min(axis=0),
+        "off_more": off.max(axis=0),
+    }

@@ -1,0 +1,53 @@
+"""Clouds of a scene to embeddings and back: padded batches in, one embedding per object out (host arrays)."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float
+
+from more2_jax.geometry.padding import MAX_POINTS, bucket, pad_batch, pad_clouds
+from more2_jax.network.prior import Prior, encode
+from more2_jax.types import Embedding, PointCloud
+
+SMALLEST_BATCH = 8  # scenes of up to so many objects share their compiled programs
+
+
+def padded(clouds: Sequence[Float[np.ndarray, "_ 3"]], smallest: int = SMALLEST_BATCH) -> PointCloud:
+    """Ragged clouds as one batch of one shape for all scenes: (bucket, `MAX_POINTS`, 3). Fillers repeat the first."""
+    return pad_batch(pad_clouds(clouds, MAX_POINTS), bucket(len(clouds), smallest))
+
+
+def embed(prior: Prior, clouds: Sequence[Float[np.ndarray, "_ 3"]]) -> list[Embedding]:
+    """One embedding per cloud, in one call."""
+    return unstack(encode(prior, padded(clouds)), len(clouds))
+
+
+def unstack(batch: Embedding, count: int) -> list[Embedding]:
+    """The first `count` embeddings of a batch, as host arrays."""
+    host = jax.device_get(batch)
+    return [jax.tree.map(lambda x, k=k: np.asarray(x[k]), host) for k in range(count)]
+
+
+def stack(
+    embeddings: Sequence[Embedding], smallest: int = SMALLEST_BATCH
+) -> tuple[Embedding, Bool[np.ndarray, " b"]]:
+    """A batch of fixed size and which of its rows are real; the fillers repeat the first."""
+    count = bucket(len(embeddings), smallest)
+    rows = [*embeddings, *[embeddings[0]] * (count - len(embeddings))]
+    return jax.tree.map(lambda *x: np.stack(x), *rows), np.arange(count) < len(embeddings)
+
+
+def with_origin(e: Embedding, origin: Float[np.ndarray, "*b 3"]) -> Embedding:
+    """The same embedding, its centre relative to another origin; the difference is taken in float64."""
+    center = np.asarray(e.center, np.float64) + np.asarray(e.origin) - origin
+    return dataclasses.replace(e, center=jnp.asarray(center, jnp.float32), origin=np.asarray(origin))
+
+
+def at_zero(e: Embedding) -> Embedding:
+    """The embedding with its local frame for a frame: what traced code takes."""
+    return dataclasses.replace(e, origin=jnp.zeros_like(e.center))

@@ -1,0 +1,138 @@
+"""What the decoder reads beside the code: the encoder's features at the observed points around a query.
+
+A code of a few hundred numbers says what kind of object this is; where its surface runs is in the points. Around a
+query the anchors' features are blended by normalised Gaussian weights, each contributing its own linear function of
+the offset, as in moving least squares: F(p) = Σ_j w_j(p) (⟨p − x_j, B_j⟩ + b_j). The same weights give the anchors'
+mean and covariance, hence the plane they lie in and where the query stands from it: features that are averages of
+positions cannot say that. Invariant, since the B_j turn with the object, and a few matrix products for any number of
+queries.
+"""
+
+from __future__ import annotations
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Bool, Float
+
+from more2_jax.network.vector_neurons import TINY, kernel_init
+from more2_jax.types import Anchors, pytree
+
+EXTRA = 5  # distances, a bandwidth
+CLOSE = 0.02  # canonical units: how far from the plane a query still counts as being at it
+LEAST_SPREAD = 1e-4  # of the anchors, squared: below it one anchor has all the weight, and there is no plane
+
+
+@pytree
+class LocalField:
+    """One level's anchors, ready to be asked: canonical units, relative to the centre."""
+
+    position: Float[Array, "a 3"]
+    mask: Bool[Array, " a"]
+    table: Float[Array, "h a t"]  # a row an anchor: columns of the products, for every bandwidth
+    bandwidth: Float[Array, " h"]
+
+
+def local_width(channels: int, bandwidths: int) -> int:
+    """How many numbers a level contributes to the decoder's input."""
+    return bandwidths * (2 * channels + EXTRA)
+
+
+class LocalLookup(nn.Module):
+    """One level: `fold` once an object, `ask` for many points."""
+
+    channels: int
+    bandwidths: tuple[float, ...]
+    inputs: int  # channels of the anchors' features
+
+    def setup(self) -> None:
+        wide = self.channels * len(self.bandwidths)
+        shape = (self.inputs, wide)
+        self.slope = self.param("slope", kernel_init, shape)
+        self.left = self.param("left", kernel_init, shape)
+        self.right = self.param("right", kernel_init, shape)
+        self.log_bandwidth = self.param("log_bandwidth", lambda _: jnp.log(jnp.array(self.bandwidths)))
+
+    def fold(self, anchors: Anchors, scale: Float[Array, ""]) -> LocalField:
+        """Every anchor's linear function in absolute form: ⟨p − x, B⟩ + b = ⟨p, B⟩ + (b − ⟨x, B⟩)."""
+        features = anchors.features * jnp.sqrt(1.0 * self.inputs)
+        position = anchors.offset / scale
+        slope = features @ self.slope
+        constant = jnp.sum((features @ self.left) * (features @ self.right), axis=-2) / 3.0
+        heads = len(self.bandwidths)
+        by_head = [jnp.split(x, heads, axis=-1) for x in (slope, constant)]
+        second = (position[:, :, None] * position[:, None, :]).reshape(-1, 9)
+        rows = [
+            jnp.concatenate(
+                [s.reshape(len(s), -1), jnp.einsum("ai,aic->ac", position, s), c, position, second],
+                axis=-1,
+            )
+            for s, c in zip(*by_head, strict=True)
+        ]
+        return LocalField(
+            position=position,
+            mask=anchors.mask,
+            table=jnp.stack(rows),
+            bandwidth=jnp.exp(self.log_bandwidth),
+        )
+
+    def ask(self, field: LocalField, q: Float[Array, "n 3"]) -> Float[Array, "n w"]:
+        """The blended functions and the distance, for every bandwidth; each of order one, near and far."""
+        # −|q − x|²/2 up to what is the same for all anchors
+        closeness = jnp.matmul(q, field.position.T, precision="highest") - 0.5 * jnp.sum(
+            field.position**2, axis=-1
+        )
+        blend = []
+        for table, bandwidth in zip(field.table, field.bandwidth, strict=True):
+            weight = jax.nn.softmax(closeness / bandwidth**2, axis=-1, where=field.mask)
+            # Positions are in the table, and covariances are small differences of their squares.
+            blend.append(self._blend(q, jnp.matmul(weight, table, precision="highest"), bandwidth))
+        return jnp.concatenate(blend, axis=-1)
+
+    def _blend(
+        self, q: Float[Array, "n 3"], mean: Float[Array, "n t"], bandwidth: Array
+    ) -> Float[Array, "n w"]:
+        c = self.channels
+        slope, of_offset, constant, near = jnp.split(mean, (3 * c, 4 * c, 5 * c), axis=-1)
+        slope, center, second = slope.reshape(-1, 3, c), near[:, :3], near[:, 3:].reshape(-1, 3, 3)
+        linear = _dot(q, slope) - of_offset
+        offset, across, spread = from_plane(q, center, second)
+        distance = root(jnp.sum(offset**2, axis=-1) + spread)  # root mean square distance to the anchors
+        height = root(jnp.sum(across**2, axis=-1))
+        return jnp.concatenate(
+            [
+                linear / (distance + bandwidth) + constant,
+                distance,
+                distance / (distance + bandwidth),
+                _dot(across, slope) / (height + CLOSE),
+                height,
+                height / (height + CLOSE),
+                root(spread),
+            ],
+            axis=-1,
+        )
+
+
+def from_plane(
+    q: Float[Array, "n 3"], center: Float[Array, "n 3"], second: Float[Array, "n 3 3"]
+) -> tuple[Float[Array, "n 3"], Float[Array, "n 3"], Float[Array, " n"]]:
+    """Offsets of queries from their neighbourhood's mean, the part of them across its plane, and its spread.
+
+    For points spread evenly in a plane the covariance is s/2 times the projection onto it, s its trace: no
+    eigenvectors, so nothing jumps where two of them change places.
+    """
+    offset = q - center
+    covariance = second - center[:, :, None] * center[:, None, :]
+    spread = jnp.maximum(jnp.trace(covariance, axis1=-2, axis2=-1), LEAST_SPREAD)
+    across = offset - 2 * jnp.einsum("nij,nj->ni", covariance, offset) / spread[:, None]
+    return offset, across, spread
+
+
+def root(squared: Float[Array, " n"]) -> Float[Array, "n 1"]:
+    """Square root as a column; its gradient at 0 is 0."""
+    return jnp.sqrt(jnp.maximum(squared, TINY))[:, None]
+
+
+def _dot(q: Float[Array, "n 3"], vectors: Float[Array, "n 3 c"]) -> Float[Array, "n c"]:
+    return q[:, :1] * vectors[:, 0] + q[:, 1:2] * vectors[:, 1] + q[:, 2:] * vectors[:, 2]

@@ -1,0 +1,191 @@
+"""The prior: encoder, decoder and their weights; initialise, save, load, encode, query."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from functools import partial
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax.traverse_util import flatten_dict, unflatten_dict
+from jax import Array
+from jax.core import Tracer
+from jaxtyping import Bool, Float
+
+from more2_jax.config import PriorConfig, from_dict
+from more2_jax.geometry.points import farthest_points
+from more2_jax.network.decoder import Decoder, ObjectField
+from more2_jax.network.encoder import Encoder, neighbour_counts
+from more2_jax.types import Embedding, PointCloud, pytree
+
+FORMAT = 1  # of weight files
+
+
+@pytree
+class Prior:
+    """Frozen weights and the settings they belong to."""
+
+    params: dict[str, Any]
+    config: PriorConfig = flax.struct.field(pytree_node=False)
+    name: str = flax.struct.field(pytree_node=False, default="unnamed")
+
+
+def init_prior(config: PriorConfig, key: Array, name: str = "random") -> Prior:
+    """Random weights. Raises ValueError if the last block would choose from fewer points than `neighbours`."""
+    e = config.encoder
+    if (least := min(neighbour_counts(e, e.points))) < e.neighbours:
+        raise ValueError(f"{e.points} points leave a block {least}; needed {e.neighbours} neighbours or more")
+    encoder_key, decoder_key = jax.random.split(key)
+    points = jax.random.normal(encoder_key, (e.points, 3))
+    mask = jnp.ones(e.points, bool)
+    encoder, embedding = _initialise(Encoder(e, keep=config.decoder.local_blocks), encoder_key, points, mask)
+    decoder, _ = _initialise(Decoder(config), decoder_key, embedding, points[:1])
+    return Prior(params={"encoder": encoder, "decoder": decoder}, config=config, name=name)
+
+
+def _initialise(module: Encoder | Decoder, key: Array, *inputs: Any) -> tuple[dict[str, Any], Any]:
+    """Weights, and zeros in the output's shapes: no weight depends on the inputs, so nothing is computed of them."""
+    output, _ = jax.eval_shape(module.init_with_output, key, *inputs)
+    variables = jax.jit(module.init)(key, *inputs)
+    return dict(variables["params"]), jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), output)
+
+
+def encode_ordered(prior: Prior, points: Float[Array, "n 3"], mask: Bool[Array, " n"]) -> Embedding:
+    """Φ of one cloud already in farthest-point order; differentiable."""
+    encoder = Encoder(prior.config.encoder, keep=prior.config.decoder.local_blocks)
+    return encoder.apply({"params": prior.params["encoder"]}, points, mask)  # type: ignore[return-value]
+
+
+def encode_one(prior: Prior, points: Float[Array, "n 3"], mask: Bool[Array, " n"]) -> Embedding:
+    """Φ of one cloud: farthest-point sampling to the encoder's input size, then the network; differentiable."""
+    return encode_ordered(prior, *farthest_points(points, mask, prior.config.encoder.points))
+
+
+@jax.jit
+def _encode_many(prior: Prior, points: Float[Array, "b n 3"], mask: Bool[Array, "b n"]) -> Embedding:
+    return jax.vmap(partial(encode_one, prior))(points, mask)
+
+
+def encode(prior: Prior, cloud: PointCloud) -> Embedding:
+    """Encodes a batch of clouds (from `pad_clouds`): Φ(sRX + t) = (F_inv, R·F_eqv, s·F_s, sR·F_c + t), paper §3.1.
+
+    Returns a batch of embeddings whose `center` is in metres relative to `origin`, which is the cloud's.
+    Raises ValueError when a cloud has no real point.
+    """
+    if cloud.points.ndim != 3:
+        raise ValueError(f"encode got points of shape {cloud.points.shape}; needed (batch, n, 3)")
+    if not isinstance(cloud.mask, Tracer) and (empty := np.flatnonzero(~np.asarray(cloud.mask.any(-1)))).size:
+        raise ValueError(f"clouds {empty.tolist()} have no points; encode needs at least one each")
+    return dataclasses.replace(_encode_many(prior, cloud.points, cloud.mask), origin=cloud.origin)
+
+
+def check_embedding(prior: Prior, embedding: Embedding, who: str) -> None:
+    """Raises ValueError unless the decoder can be asked about the embedding, which another encoder may have made."""
+    needed, got = len(prior.config.decoder.local_blocks), len(embedding.anchors)
+    if got != needed:
+        raise ValueError(
+            f"{who} got embeddings with {got} levels of anchors; the decoder of prior {prior.name!r} needed {needed}, "
+            "as its own encoder makes"
+        )
+
+
+def object_field(prior: Prior, embedding: Embedding) -> ObjectField:
+    """Folds one object's code into the decoder; then `field_sdf` is cheap for many points."""
+    decoder = Decoder(prior.config)
+    return decoder.apply({"params": prior.params["decoder"]}, embedding, method="field")  # type: ignore[return-value]
+
+
+def field_sdf(prior: Prior, field: ObjectField, points: Float[Array, "n 3"]) -> Float[Array, " n"]:
+    """Signed distance at points of the embedding's local frame; canonical units, negative inside."""
+    decoder = Decoder(prior.config)
+    return decoder.apply({"params": prior.params["decoder"]}, field, points, method="distance")  # type: ignore[return-value]
+
+
+def sdf_one(prior: Prior, embedding: Embedding, points: Float[Array, "n 3"]) -> Float[Array, " n"]:
+    """Ψ for one object: signed distance at local points, canonical units (metres are the value × F_s)."""
+    return field_sdf(prior, object_field(prior, embedding), points)
+
+
+@jax.jit
+def _sdf_many(prior: Prior, embedding: Embedding, points: Float[Array, "b n 3"]) -> Float[Array, "b n"]:
+    return jax.vmap(partial(sdf_one, prior))(embedding, points)
+
+
+def sdf(
+    prior: Prior, embedding: Embedding, points: Float[Array | np.ndarray, "b n 3"]
+) -> Float[Array, "b n"]:
+    """Signed distances of a batch of objects at points in each scan's frame (metres), canonical units.
+
+    Multiply by `embedding.scale` for metres; negative inside (paper §3.1). Raises ValueError on shapes that differ, and
+    on embeddings that the decoder cannot be asked about.
+    """
+    check_embedding(prior, embedding, "sdf")
+    if points.ndim != 3 or points.shape[0] != embedding.scale.shape[0]:
+        raise ValueError(
+            f"sdf got points {points.shape} for {embedding.scale.shape} objects; needed (objects, n, 3)"
+        )
+    local = jnp.asarray(points - embedding.origin[:, None], jnp.float32)
+    at_zero = dataclasses.replace(embedding, origin=jnp.zeros_like(embedding.center))
+    return _sdf_many(prior, at_zero, local)
+
+
+def save_prior(prior: Prior, path: str | Path, half: bool = True) -> None:
+    """Writes weights and settings as one .npz (half precision unless `half` is False)."""
+    flat = flatten_dict(jax.device_get(prior.params), sep="/")
+    kind = np.float16 if half else np.float32
+    header = json.dumps({"format": FORMAT, "name": prior.name, "config": dataclasses.asdict(prior.config)})
+    arrays: dict[str, Any] = {k: np.asarray(v, kind) for k, v in flat.items()}
+    np.savez_compressed(path, __header__=np.array(header), **arrays)
+
+
+def load_prior(name: str | Path) -> Prior:
+    """Loads shipped weights by name (`small`) or a file that `save_prior` wrote; ValueError says what is wrong."""
+    path = _locate(name)
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            header = json.loads(str(file["__header__"]))
+            flat = {k: jnp.asarray(file[k], jnp.float32) for k in file.files if k != "__header__"}
+    except (KeyError, ValueError, OSError, EOFError) as error:
+        raise ValueError(
+            f"{path}: not a more2_jax weight file ({error}); `more2 prior import` makes one"
+        ) from error
+    if header.get("format") != FORMAT:
+        raise ValueError(f"{path}: weight format {header.get('format')!r}; needed {FORMAT}")
+    config = from_dict(PriorConfig, header["config"], where=str(path))
+    prior = Prior(params=unflatten_dict(flat, sep="/"), config=config, name=header["name"])
+    check_shapes(prior, str(path))
+    return prior
+
+
+def _flat(params: dict[str, Any]) -> dict[str, Any]:
+    return dict(flatten_dict(params, sep="/"))
+
+
+def _locate(name: str | Path) -> Path:
+    shipped = Path(str(resources.files("more2_jax"))) / "assets" / "weights" / f"{name}.npz"
+    if shipped.is_file():
+        return shipped
+    if Path(name).is_file():
+        return Path(name)
+    raise ValueError(f"prior {str(name)!r}: neither shipped ({', '.join(shipped_priors())}) nor a file")
+
+
+def shipped_priors() -> list[str]:
+    """Names of the weights inside the package."""
+    folder = Path(str(resources.files("more2_jax"))) / "assets" / "weights"
+    return sorted(p.stem for p in folder.glob("*.npz"))
+
+
+def check_shapes(prior: Prior, where: str) -> None:
+    """Raises ValueError, naming the first array that is missing, unknown or of another shape."""
+    model = jax.eval_shape(lambda key: init_prior(prior.config, key).params, jax.random.key(0))
+    needed, got = ({k: jnp.shape(v) for k, v in _flat(tree).items()} for tree in (model, prior.params))
+    for name in sorted(needed | got):
+        if needed.get(name) != got.get(name):
+            raise ValueError(f"{where}: weights {name} have shape {got.get(name)}; needed {needed.get(name)}")

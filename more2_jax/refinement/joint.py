@@ -1,0 +1,139 @@
+"""Joint optimisation of one object's shape code and poses over all its observations (paper §3.5)."""
+
+from __future__ import annotations
+
+import dataclasses
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import jaxlie
+import optax
+from jax import Array
+from jax.core import Tracer
+from jaxtyping import Bool, Float
+
+from more2_jax.config import JointConfig
+from more2_jax.geometry.points import cloud_radius, farthest_points, transformed
+from more2_jax.geometry.se3_descent import adam, descend
+from more2_jax.geometry.transform import move_embedding, scale_embedding
+from more2_jax.network.prior import Prior, field_sdf, object_field
+from more2_jax.types import Embedding, JointFit, pytree
+
+
+@pytree
+class Observations:
+    """One object, seen up to k times; every cloud in its own local frame. Row 0 is the reference."""
+
+    points: Float[Array, "*b k n 3"]
+    mask: Bool[Array, "*b k n"]
+    real: Bool[Array, "*b k"]  # False: padding
+    codes: Embedding  # (*b, k, …): of every observation alone
+    T_ref_obs: jaxlie.SE3  # (*b, k): observation's local frame to the reference's
+    accumulated: Embedding  # (*b, …): of all observations together, in the reference's local frame
+
+
+def fit_jointly(prior: Prior, observations: Observations, config: JointConfig) -> JointFit:
+    """Optimises code and poses of a batch of objects in one call (paper §3.5); frame: the reference's local one.
+
+    Raises ValueError when an object has no reference observation.
+    """
+    if not isinstance(observations.real, Tracer) and not bool(observations.real[:, 0].all()):
+        raise ValueError(
+            "fit_jointly got an object without observation 0; needed the reference observation there"
+        )
+    return _fit_many(prior, observations, config)
+
+
+@partial(jax.jit, static_argnames="config")
+def _fit_many(prior: Prior, observations: Observations, config: JointConfig) -> JointFit:
+    return jax.vmap(lambda one: fit_one(prior, one, config))(observations)
+
+
+def fit_one(prior: Prior, seen: Observations, config: JointConfig) -> JointFit:
+    """`fit_jointly` for one object, in units of the reference cloud's radius."""
+    seen = thin(seen, config.points)
+    radius = cloud_radius(seen.points[0], seen.mask[0])
+    seen = rescale(seen, 1 / radius)
+    start = seen.accumulated if config.start == "accumulated" else best_code(prior, seen)
+    free = {"inv": start.inv, "eqv": start.eqv, "center": start.center, "pose": seen.T_ref_obs}
+
+    def loss(free: dict[str, Any]) -> Float[Array, ""]:
+        code = dataclasses.replace(start, inv=free["inv"], eqv=free["eqv"], center=free["center"])
+        return surface_loss(prior, code, free["pose"], seen) + departure(code, start)
+
+    best, lowest = descend(loss, free, optimiser(config), config.steps)
+    # The reference observation defines the frame: all is moved back by what it drifted.
+    drift = jax.tree.map(lambda x: x[0], best["pose"]).inverse()
+    code = dataclasses.replace(start, inv=best["inv"], eqv=best["eqv"], center=best["center"])
+    poses = jax.vmap(lambda T: drift @ T)(best["pose"])
+    return JointFit(
+        embedding=scale_embedding(move_embedding(code, drift), radius),
+        T_ref_obs=_scale_translation(poses, radius),
+        loss=lowest,
+    )
+
+
+def optimiser(config: JointConfig) -> optax.GradientTransformation:
+    """Adam with the paper's own step size for every variable."""
+    rates = {
+        "inv": config.inv_learning_rate,
+        "eqv": config.eqv_learning_rate,
+        "center": config.center_learning_rate,
+        "pose": config.pose_learning_rate,
+    }
+    return optax.multi_transform({k: adam(rate) for k, rate in rates.items()}, {k: k for k in rates})
+
+
+def surface_loss(
+    prior: Prior, code: Embedding, T_ref_obs: jaxlie.SE3, seen: Observations
+) -> Float[Array, ""]:
+    """Σ over observations of the mean |Ψ| at their points; canonical units."""
+    field = object_field(prior, code)
+
+    def one(T: jaxlie.SE3, points: Array, mask: Array, real: Array) -> Array:
+        distance = jnp.where(mask, jnp.abs(field_sdf(prior, field, transformed(T, points))), 0.0)
+        return real * distance.sum() / jnp.maximum(mask.sum(), 1)
+
+    return jax.vmap(one)(T_ref_obs, seen.points, seen.mask, seen.real).sum()
+
+
+def departure(code: Embedding, start: Embedding) -> Float[Array, ""]:
+    """‖F' − F_0‖₂: keeps the code from drifting to a field that is zero everywhere."""
+    squared = [jnp.sum((getattr(code, k) - getattr(start, k)) ** 2) for k in ("inv", "eqv", "center")]
+    return jnp.sqrt(sum(squared, jnp.zeros(())) + 1e-16)
+
+
+def best_code(prior: Prior, seen: Observations) -> Embedding:
+    """X*: the code of the observation it explains best, moved into the reference's frame."""
+
+    def own_loss(code: Embedding, points: Array, mask: Array) -> Array:
+        distance = jnp.abs(field_sdf(prior, object_field(prior, code), points))
+        return jnp.where(mask, distance, 0.0).sum() / jnp.maximum(mask.sum(), 1)
+
+    losses = jax.vmap(own_loss)(seen.codes, seen.points, seen.mask)
+    best = jnp.argmin(jnp.where(seen.real & jnp.isfinite(losses), losses, jnp.inf))
+    code, T = jax.tree.map(lambda x: x[best], (seen.codes, seen.T_ref_obs))
+    return move_embedding(code, T)
+
+
+def thin(seen: Observations, points: int) -> Observations:
+    """Every cloud in farthest-point order, at most `points`."""
+    clouds, mask = jax.vmap(lambda p, m: farthest_points(p, m, points))(seen.points, seen.mask)
+    return dataclasses.replace(seen, points=clouds, mask=mask)
+
+
+def rescale(seen: Observations, factor: Float[Array, ""]) -> Observations:
+    """The observations in other units of length."""
+    return dataclasses.replace(
+        seen,
+        points=seen.points * factor,
+        codes=scale_embedding(seen.codes, factor),
+        accumulated=scale_embedding(seen.accumulated, factor),
+        T_ref_obs=_scale_translation(seen.T_ref_obs, factor),
+    )
+
+
+def _scale_translation(T: jaxlie.SE3, factor: Float[Array, ""]) -> jaxlie.SE3:
+    return jaxlie.SE3.from_rotation_and_translation(T.rotation(), T.translation() * factor)

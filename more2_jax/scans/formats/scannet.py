@@ -1,0 +1,107 @@
+"""ScanNet (Dai et al. 2017): `<scene>_vh_clean_2.ply` with its segments and their aggregation beside it.
+
+`objectId` counts from 0, so instance i here is object i - 1 there. Points are in the mesh's own frame, z up;
+`axis_alignment` gives the turn to the frame of the benchmark.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from more2_jax.scans.files.ply_cloud import read_ply
+from more2_jax.scans.formats import ply_scan
+from more2_jax.scans.labeled_cloud import LabelledCloud, ReadOptions, one_line
+from more2_jax.scans.segment_groups import instances_of, read_groups, read_segment_indices
+from more2_jax.scans.structural_labels import drop_background
+
+MESH = "_vh_clean_2.ply"
+SEGMENTS = "_vh_clean_2.0.010000.segs.json"
+AGGREGATIONS = (".aggregation.json", "_vh_clean_2.aggregation.json")
+SHIFT = 1  # 0 is the first object there, background here
+
+
+def recognises(path: Path) -> bool:
+    """Whether this is such a mesh, or a folder with one."""
+    if path.is_dir():
+        return any(path.glob(f"*{MESH}"))
+    return path.is_file() and path.name.endswith(MESH)
+
+
+def read(path: Path, options: ReadOptions) -> LabelledCloud:
+    """The vertices, each in the instance that its segment belongs to; walls, floors and the like are background.
+
+    Raises ValueError, in one line, when a file of the scene is missing, damaged or does not fit the mesh.
+    """
+    mesh = _mesh(path)
+    if options.instance_property is not None:
+        return ply_scan.read(mesh, options)
+    cloud = read_ply(mesh)
+    if options.masks or not (options.masks_needed or _annotated(mesh)):
+        return LabelledCloud(points=cloud.points, instance=None, colors=cloud.colors, unit="m")
+    groups = read_groups(_beside(mesh, *AGGREGATIONS))
+    if any(group.id < 0 for group in groups):
+        raise ValueError(f"{_beside(mesh, *AGGREGATIONS)}: a negative objectId; needed 0 or more")
+    indices = read_segment_indices(_beside(mesh, SEGMENTS), len(cloud.points))
+    instance, labels, empty = instances_of(groups, indices, SHIFT)
+    instance, structural = drop_background(instance, labels)
+    return LabelledCloud(
+        points=cloud.points,
+        instance=instance,
+        colors=cloud.colors,
+        labels=labels,
+        skipped=(*structural, *empty),
+        unit="m",
+    )
+
+
+def axis_alignment(path: Path) -> Float[np.ndarray, "4 4"]:
+    """`T_aligned_mesh` of a scene (its folder or mesh) from `<scene>.txt`: 16 numbers, row-major, metres."""
+    info = _beside(_mesh(path), ".txt")
+    try:
+        text = info.read_text(encoding="utf-8", errors="replace")
+    except OSError as error:
+        raise ValueError(f"{info}: not readable ({one_line(error)})") from error
+    for line in text.splitlines():
+        name, _, value = line.partition("=")
+        if name.strip() == "axisAlignment":
+            return _matrix(info, value)
+    raise ValueError(f"{info}: no line axisAlignment; needed 16 numbers, row-major")
+
+
+def _matrix(info: Path, text: str) -> Float[np.ndarray, "4 4"]:
+    try:
+        numbers = np.array([float(word) for word in text.split()])
+    except ValueError as error:
+        raise ValueError(f"{info}: axisAlignment is not numbers; needed 16, row-major") from error
+    if numbers.shape != (16,) or not np.isfinite(numbers).all():
+        raise ValueError(
+            f"{info}: axisAlignment has {numbers.size} numbers; needed 16 finite ones, row-major"
+        )
+    return numbers.reshape(4, 4)
+
+
+def _annotated(mesh: Path) -> bool:
+    """Whether the scene has its annotation; those of the hidden test set have none."""
+    return any(mesh.with_name(mesh.name.removesuffix(MESH) + ending).is_file() for ending in AGGREGATIONS)
+
+
+def _mesh(path: Path) -> Path:
+    if not path.is_dir():
+        return path
+    meshes = sorted(path.glob(f"*{MESH}"))
+    if len(meshes) != 1:
+        raise ValueError(f"{path}: {len(meshes)} meshes *{MESH}; needed one (name it)")
+    return meshes[0]
+
+
+def _beside(mesh: Path, *endings: str) -> Path:
+    """The file of the scene with the first of these endings that is there."""
+    scene = mesh.name.removesuffix(MESH)
+    found = [mesh.with_name(scene + ending) for ending in endings]
+    for file in found:
+        if file.is_file():
+            return file
+    raise ValueError(f"{mesh}: no {found[0].name} beside it; needed the annotation, or masks of your own")

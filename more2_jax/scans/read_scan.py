@@ -1,0 +1,225 @@
+"""Scans as people have them, read into a `Scan` by whichever of `FORMATS` recognises the path."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from more2_jax.scans.formats.registry import FORMATS, WITH_DEPTH_FRAMES
+from more2_jax.scans.geometric_segmentation import SegmentationConfig, segment_geometric
+from more2_jax.scans.labeled_cloud import LabelledCloud, ReadOptions, one_line
+from more2_jax.scans.predicted_masks import lay_masks
+from more2_jax.types import Instance, Scan, Skipped
+
+UNITS_M = {"m": 1.0, "cm": 0.01, "mm": 0.001}
+SMALLEST_M, LARGEST_M = 0.02, 20.0  # a median object beyond these means another unit than was said
+MASKS_ARE_BETTER = (
+    "instances are clusters, found without a network: objects that touch are one. Masks from a network are"
+    " better: pass Mask3D's output with --masks, or name an instance property with --instance-property"
+)
+LARGEST_COORDINATE = 1e12  # in any unit; beyond, squares and sums lose all meaning
+CM_OR_MM = 380.0  # between 120 and 1200, a chair in either
+
+
+def read_scan(
+    path: str | Path,
+    *,
+    instance_property: str | None = None,
+    unit: str = "m",
+    min_points: int = 64,
+    masks: str | Path | None = None,
+    min_score: float = 0.5,
+    segment: Literal["geometric"] | None = None,
+    depth_frames: bool = False,
+) -> Scan:
+    """Reads one scan: instances in metres (float64, the scan's own frame), and what was left out.
+
+    `path` is a PLY whose vertices carry an integer property naming the instance (`instance`, `instance_id`,
+    `objectId`, `object_id` or `label`, in this order; `instance_property` names another), an NPZ with
+    `points` (n, 3), `instance` (n,) and optional `label` (n,), `color` or `colors` (n, 3), `sensors` (s, 3), a folder
+    of one PLY per object, or another of `data.formats.registry`. `<scan>.sensors.txt` beside it may say where its
+    sensors stood, x y z a line. Instance ids ≤ 0 are background. `unit` is the file's: m, cm or mm.
+    Instances of fewer than `min_points` points are reported in `Scan.skipped`; sizes that look like another
+    unit, in `Scan.warnings`. `masks` are predicted ones (`data.masks`): those scored `min_score` or more replace
+    the scan's own. `segment="geometric"` cuts a cloud without instances into planes and clusters; `depth_frames`
+    reads the raw depth of 3RScan, not its mesh (METHOD 8).
+
+    Raises ValueError, in one line, when the file is missing, unknown, damaged, has no instance property, has
+    coordinates that are not finite, or no instance is left.
+    """
+    path = Path(path)
+    if unit not in UNITS_M or segment not in (None, "geometric"):
+        raise ValueError(f"unit {unit!r}, segment {segment!r}; needed m, cm or mm; geometric or None")
+    masks = None if masks is None else Path(masks)
+    needed = segment is None and masks is None
+    options = ReadOptions(
+        instance_property=instance_property, masks=masks, masks_needed=needed, depth_frames=depth_frames
+    )
+    cloud = _read(path, options)
+    if masks is not None:
+        cloud = lay_masks(cloud, path, masks, min_score)
+    if segment is not None:
+        cloud = _segmented(path, cloud, unit)
+    return _scan(path, cloud, unit, min_points)
+
+
+def _segmented(path: Path, cloud: LabelledCloud, unit: str) -> LabelledCloud:
+    """Clusters as instances where the cloud has none of its own; says what was done."""
+    if cloud.instance is not None:
+        said = "the scan has instance masks, so --segment geometric is not used"
+        return replace(cloud, warnings=(*cloud.warnings, said))
+    _check_points(path, cloud.points)
+    try:
+        found = segment_geometric(cloud.points * UNITS_M[cloud.unit or unit], SegmentationConfig())
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+    if not found.instance.any():
+        raise ValueError(f"{path}: no instances left after segmentation; {'; '.join(found.sentences())}")
+    return replace(
+        cloud,
+        instance=found.instance,
+        skipped=(*cloud.skipped, *found.skipped),
+        warnings=(*cloud.warnings, MASKS_ARE_BETTER, *found.sentences()),
+    )
+
+
+def _read(path: Path, options: ReadOptions) -> LabelledCloud:
+    """What the first format that recognises the path reads."""
+    if not path.exists():
+        raise ValueError(f"{path}: no such file or folder")
+    for form in FORMATS:
+        if form.recognises(path):
+            if options.depth_frames and form not in WITH_DEPTH_FRAMES:
+                raise ValueError(f"{path}: depth frames asked for; needed the folder of a 3RScan scan")
+            try:
+                with np.errstate(
+                    over="ignore", invalid="ignore"
+                ):  # inf and NaN: refused once they are points
+                    return form.read(path, options)
+            except OSError as error:
+                raise ValueError(f"{path}: not readable ({one_line(error)})") from error
+            except ValueError as error:
+                if str(error).isprintable():
+                    raise
+                raise ValueError(one_line(error)) from error  # names from the file may hold anything
+    what = "a folder without .ply files" if path.is_dir() else f"suffix {path.suffix!r}"
+    raise ValueError(f"{path}: {what}; needed a .ply, an .npz, or a folder of one .ply per object")
+
+
+def _check_points(path: Path, points: Float[np.ndarray, "n 3"]) -> None:
+    if not len(points):
+        raise ValueError(f"{path}: no instances left; the scan has no points")
+    if bad := int((~np.isfinite(points).all(axis=1)).sum()):
+        raise ValueError(f"{path}: {bad} of {len(points)} points have NaN or infinite coordinates")
+    if bad := int((np.abs(points) > LARGEST_COORDINATE).any(axis=1).sum()):
+        raise ValueError(
+            f"{path}: {bad} of {len(points)} points have coordinates beyond {LARGEST_COORDINATE:g}"
+        )
+
+
+# --- from labelled points to instances ----------------------------------------------------------------------
+
+
+def _scan(path: Path, cloud: LabelledCloud, unit: str, min_points: int) -> Scan:
+    unit = cloud.unit or unit
+    if cloud.instance is None:
+        raise ValueError(
+            f"{path}: no instance masks; pass predicted ones with --masks, or --segment geometric"
+        )
+    _check_points(path, cloud.points)
+    points = cloud.points * UNITS_M[unit]
+    sensors = sensors_of(path, cloud)
+    background = points[cloud.instance <= 0]
+    kept, skipped = _instances(cloud, cloud.instance, points, min_points)
+    if not kept:
+        raise ValueError(f"{path}: no instances left; {_why_none(len(background), skipped, min_points)}")
+    return Scan(
+        name=path.stem if path.is_file() else path.resolve().name,
+        source=str(path),
+        instances=kept,
+        background=background,
+        sensors=sensors * UNITS_M[unit],
+        skipped=(*cloud.skipped, *skipped),
+        warnings=(*cloud.warnings, *_unit_warnings(kept, unit)),
+    )
+
+
+def sensors_of(path: Path, cloud: LabelledCloud) -> Float[np.ndarray, "s 3"]:
+    """Where the scan's sensors stood: what `<scan>.sensors.txt` beside it says, else what the scan itself says.
+
+    A line a place, x y z as the scan's points. None (0 rows) where neither says. Raises ValueError, in one line,
+    where that is no list of finite places.
+    """
+    beside = path.with_name(f"{path.stem if path.is_file() else path.name}.sensors.txt")
+    sensors = np.zeros((0, 3)) if cloud.sensors is None else cloud.sensors
+    if beside.is_file():
+        path = beside
+        try:
+            lines = [line for line in beside.read_text(encoding="utf-8").splitlines() if line.strip()]
+            sensors = np.loadtxt(lines, np.float64, ndmin=2) if lines else np.zeros((0, 0))
+        except (ValueError, OSError) as error:
+            raise ValueError(f"{beside}: not numbers ({one_line(error)}); needed lines of x y z") from error
+    if sensors.shape[1:] != (3,) or not np.isfinite(sensors).all():
+        raise ValueError(f"{path}: places of sensors {sensors.shape}; needed (s, 3) finite numbers")
+    return sensors
+
+
+def _instances(
+    cloud: LabelledCloud, instance: Int[np.ndarray, " n"], points: Float[np.ndarray, "n 3"], min_points: int
+) -> tuple[tuple[Instance, ...], tuple[Skipped, ...]]:
+    """Splits the points by instance in one sort; ids ascend, points keep the file's order."""
+    order = np.argsort(instance, kind="stable")
+    ids, starts = np.unique(instance[order], return_index=True)
+    kept: list[Instance] = []
+    skipped: list[Skipped] = []
+    for index, rows in zip(ids.tolist(), np.split(order, starts[1:]), strict=True):
+        if index <= 0:
+            continue
+        if len(rows) < min_points:
+            reason = f"{len(rows)} points; needed {min_points}"
+            skipped.append(Skipped(what=f"instance {index}", reason=reason))
+            continue
+        colors = None if cloud.colors is None else cloud.colors[rows]
+        kept.append(Instance(id=index, points=points[rows], label=_label(cloud, index, rows), colors=colors))
+    return tuple(kept), tuple(skipped)
+
+
+def _label(cloud: LabelledCloud, index: int, rows: np.ndarray) -> str | None:
+    """What most of the instance's points say; the first in order where two say it equally often."""
+    if cloud.point_labels is None:
+        return cloud.labels.get(index)
+    values, counts = np.unique(cloud.point_labels[rows], return_counts=True)
+    most = values[np.argmax(counts)]
+    text = most.decode("utf-8", "replace") if isinstance(most, bytes) else str(most)
+    return text or None
+
+
+def _why_none(background: int, skipped: tuple[Skipped, ...], min_points: int) -> str:
+    if not skipped:
+        return f"all {background} points are background (instance ≤ 0)"
+    return f"{len(skipped)} had fewer than {min_points} points; {background} points are background"
+
+
+def median_diagonal(instances: tuple[Instance, ...]) -> float:
+    """Median over instances of the diagonal of the bounding box, in the unit of their points."""
+    return float(np.median([np.linalg.norm(np.ptp(i.points, axis=0)) for i in instances]))
+
+
+def likely_unit(diagonal: float) -> str:
+    """The unit in which furniture would have this diagonal: 1 or 2 m, 100 or 200 cm, 1000 or 2000 mm."""
+    if diagonal <= LARGEST_M:
+        return "m"
+    return "cm" if diagonal <= CM_OR_MM else "mm"
+
+
+def _unit_warnings(instances: tuple[Instance, ...], unit: str) -> tuple[str, ...]:
+    diagonal_m = median_diagonal(instances)
+    if SMALLEST_M <= diagonal_m <= LARGEST_M:
+        return ()
+    likely = likely_unit(diagonal_m / UNITS_M[unit])
+    advice = f"; if the scan is in {likely}, pass --unit {likely}" if likely != unit else ""
+    return (f"the median object measures {diagonal_m:.4g} m across, which is unlikely for furniture{advice}",)

@@ -1,0 +1,76 @@
+"""What sensors saw of and around the instances of a new scan, and the objects of a living scene."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+from more2_jax.geometry.free_space import sight_of, spread, stacked, view_of
+from more2_jax.geometry.poses import Points, apply_pose
+from more2_jax.geometry.transform import moved_sight
+from more2_jax.tracking.objects import accumulated, accumulated_points, points_of
+from more2_jax.types import Instance, Observation, Scan, ScanRecord, SceneObject, Sight
+
+SENSORS = 64  # of a scan that are remembered
+
+
+def few_sensors(scan: Scan) -> Points:
+    """The places of a scan's sensors, at even steps: `SENSORS` at most."""
+    return scan.sensors[:: max(1, -(-len(scan.sensors) // SENSORS))]
+
+
+def instances_with_sight(instances: Sequence[Instance], scan: Scan, background: Points) -> list[Instance]:
+    """The instances with what the scan's sensors saw around each. `background`: as the scene remembers it."""
+    if not len(scan.sensors):
+        return list(instances)
+    room = np.concatenate([*(i.points for i in scan.instances), background])
+    sensors = few_sensors(scan)
+    return [dataclasses.replace(i, sight=sight_of(i.points, room, sensors)) for i in instances]
+
+
+def objects_with_sight(objects: Sequence[SceneObject], scans: Sequence[ScanRecord]) -> list[SceneObject]:
+    """The objects with what was seen around each, in its own frame, by the scans that make up its shape."""
+    rooms = {s.index: _room(s, objects) for s in scans if len(s.sensors)}
+    return [dataclasses.replace(o, sight=_object_sight(o, scans, rooms)) for o in objects]
+
+
+def _room(scan: ScanRecord, objects: Sequence[SceneObject]) -> Points:
+    """All points of a scan that the scene remembers, in the scan's frame."""
+    there = [points_of(o, seen) for o in objects for seen in o.observations if seen.scan == scan.index]
+    return np.concatenate([*there, scan.background])
+
+
+def _object_sight(o: SceneObject, scans: Sequence[ScanRecord], rooms: dict[int, Points]) -> Sight | None:
+    """The views of its accumulated observations that lie farthest apart."""
+    eyes = [(seen, eye) for seen in accumulated(o) if seen.scan in rooms for eye in scans[seen.scan].sensors]
+    around = [apply_pose(seen.T_ref_scan, eye[None])[0] for seen, eye in eyes]
+    views = []
+    for seen, eye in (eyes[k] for k in spread(around, accumulated_points(o).mean(axis=0))):
+        view = view_of(points_of(o, seen), rooms[seen.scan], eye)
+        if view is not None:
+            views.append(moved_sight(view, seen.T_ref_scan))
+    return stacked(views)
+
+
+def seen_from(o: SceneObject, scans: Sequence[ScanRecord]) -> Float[np.ndarray, "n s 3"] | None:
+    """Of every accumulated point, the places of the sensors that may have seen it, in the object's frame.
+
+    `VIEWS` of a scan at most; NaN fills up. None where no sensor is known.
+    """
+    eyes = {seen.scan: _eyes(o, seen, scans[seen.scan]) for seen in accumulated(o)}
+    most = max(len(e) for e in eyes.values())
+    if not most:
+        return None
+    of_scan = np.full((max(eyes) + 1, most, 3), np.nan)
+    for scan, places in eyes.items():
+        of_scan[scan, : len(places)] = places
+    return of_scan[o.point_scan[np.isin(o.point_scan, list(eyes))]]
+
+
+def _eyes(o: SceneObject, seen: Observation, scan: ScanRecord) -> Points:
+    """The sensors of an observation that lie farthest apart, in the object's frame."""
+    places = apply_pose(seen.T_ref_scan, scan.sensors)
+    return places[spread(list(places), accumulated_points(o).mean(axis=0))]

@@ -1,0 +1,144 @@
+"""The objects of a living scene: how they begin, gain observations, move between scans."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from jaxtyping import Float
+from scipy.special import ndtr
+
+from more2_jax.config import SceneConfig
+from more2_jax.geometry.poses import Points, Pose, apply_pose, rotation_error_deg
+from more2_jax.matching.color import color_of, pooled
+from more2_jax.types import Changes, Embedding, Frame, Instance, Observation, SceneObject
+
+# Registration takes correspondences as independent: true errors are larger than it says, by about this much.
+OPTIMISM = 3.0
+SCENE_FRAME = Frame()  # that of the first scan
+SURE = 2.0  # standard errors that a motion must exceed
+
+
+def new_object(
+    number: int, scan: int, instance: Instance, embedding: Embedding, frame: Frame = SCENE_FRAME
+) -> SceneObject:
+    """An object seen for the first time: this observation is its reference. `frame`: of the scan."""
+    own = Observation(
+        scan=scan,
+        instance=instance.id,
+        T_ref_scan=np.eye(4),
+        score=1.0,
+        rms_m=0.0,
+        converged=True,
+        frame=frame,
+    )
+    return SceneObject(
+        id=f"object_{number:03d}",
+        label=instance.label,
+        reference_scan=scan,
+        observations=(own,),
+        points=instance.points,
+        point_scan=np.full(len(instance.points), scan),
+        embedding=embedding,
+        color=color_of(instance.colors),
+    )
+
+
+def seen_again(o: SceneObject, instance: Instance, seen: Observation) -> SceneObject:
+    """The object with one more observation; its mesh is out of date if that is accumulated."""
+    return dataclasses.replace(
+        o,
+        observations=(*o.observations, seen),
+        points=np.concatenate([o.points, apply_pose(seen.T_ref_scan, instance.points)]),
+        point_scan=np.concatenate([o.point_scan, np.full(len(instance.points), seen.scan)]),
+        mesh=None if seen.accumulated else o.mesh,
+        color=pooled(o.color, color_of(instance.colors)) if seen.accumulated else o.color,
+    )
+
+
+def accumulated(o: SceneObject) -> list[Observation]:
+    """The observations that make up the object's shape; the reference is one of them."""
+    return [seen for seen in o.observations if seen.accumulated]
+
+
+def accumulated_points(o: SceneObject) -> Points:
+    """The points of those observations, in the object's reference frame."""
+    if all(seen.accumulated for seen in o.observations):
+        return o.points
+    return o.points[np.isin(o.point_scan, [seen.scan for seen in accumulated(o)])]
+
+
+def points_of(o: SceneObject, seen: Observation) -> Points:
+    """The points of one observation, in its scan's frame."""
+    return apply_pose(np.linalg.inv(seen.T_ref_scan), o.points[o.point_scan == seen.scan])
+
+
+def observation_in(o: SceneObject, scan: int) -> Observation | None:
+    """The object's observation in a scan, if it was there."""
+    return next((seen for seen in o.observations if seen.scan == scan), None)
+
+
+def last_center(o: SceneObject) -> Float[np.ndarray, "3"]:
+    """Where the object was when last seen: its accumulated cloud's mean, in the scene's frame."""
+    return apply_pose(place_of(o.observations[-1]), accumulated_points(o).mean(axis=0, keepdims=True))[0]
+
+
+def place_of(seen: Observation) -> Pose:
+    """T_scene_ref: takes an object's points to where an observation has them, in the scene's frame."""
+    return seen.frame.T_scene_scan @ np.linalg.inv(seen.T_ref_scan)
+
+
+def motion_between(o: SceneObject, before: Observation, after: Observation) -> tuple[float, float]:
+    """How far (metres, at the object's mean) and by what angle (degrees) it moved, in the scene's frame."""
+    first, then = place_of(before), place_of(after)
+    center = accumulated_points(o).mean(axis=0, keepdims=True)
+    distance = float(np.linalg.norm(apply_pose(then, center) - apply_pose(first, center)))
+    return distance, float(rotation_error_deg(then[:3, :3], first[:3, :3]))
+
+
+def changes_between(
+    objects: Sequence[SceneObject],
+    a: int,
+    b: int,
+    config: SceneConfig,
+    chance: Mapping[str, float] | None = None,
+) -> Changes:
+    """What moved, stayed, came (also: came back) and went between two scans.
+
+    `chance`: probabilities, by object, that what came or went did. Those of motion are worked out here.
+    """
+    found: dict[str, list[str]] = {"moved": [], "static": [], "added": [], "removed": []}
+    probability: dict[str, float] = {}
+    for o in objects:
+        before, after = observation_in(o, a), observation_in(o, b)
+        if before and after:
+            moved = moved_probability(o, before, after, config)
+            found["moved" if moved > 0.5 else "static"].append(o.id)
+            probability[o.id] = max(moved, 1 - moved)
+        elif before or after:
+            found["removed" if before else "added"].append(o.id)
+            if chance and o.id in chance:
+                probability[o.id] = chance[o.id]
+    lists = {k: tuple(v) for k, v in found.items()}
+    return Changes(from_scan=a, to_scan=b, **lists, probability=probability)
+
+
+def moved_probability(o: SceneObject, before: Observation, after: Observation, config: SceneConfig) -> float:
+    """That an object moved: by more than `static_m` or `static_deg`, and than registration's own error explains.
+
+    Measured motions are taken as normal about the true ones. Without an error (`paper`), 0 or 1.
+    """
+    distance, angle_deg = motion_between(o, before, after)
+    found = []
+    for motion, limit, own in (
+        (distance, config.static_m, "sigma_m"),
+        (angle_deg, config.static_deg, "sigma_deg"),
+    ):
+        frames = [getattr(seen.frame, own) for seen in (before, after)]
+        error = float(
+            np.hypot(OPTIMISM * np.hypot(getattr(before, own), getattr(after, own)), np.hypot(*frames))
+        )
+        limit = max(limit, SURE * error)
+        found.append(float(ndtr((motion - limit) / error)) if error > 0 else float(motion > limit))
+    return max(found)

@@ -1,0 +1,86 @@
+"""How a scan's frame lies in the scene's: a common height first, then the motion that most of what stayed agrees on.
+
+Beyond the paper (preset `robust`). The scene's frame is that of its first scan. Heights, "it did not move" and the
+metres that a thing moved mean nothing until scans are in one frame.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from more2_jax.config import SceneConfig
+from more2_jax.geometry.poses import Points, Pose, apply_pose
+from more2_jax.geometry.transform import lift
+from more2_jax.matching.candidates import PairFits, fit_pairs
+from more2_jax.network.prior import Prior
+from more2_jax.tracking.pose_voting import (
+    FEWEST,
+    ROOM_WORSE,
+    Votes,
+    estimate,
+    most_agreed,
+    position_sigma,
+    room_misfit,
+    with_errors,
+)
+from more2_jax.tracking.scan_height import Rooms, common_height
+from more2_jax.types import Frame, ObservedObject
+
+GIVEN_M = 0.01  # by more than this a frame as given is off where another takes its place,
+MUCH_LESS = 0.5  # which leaves at most this share of what the given one leaves of the votes,
+SURE = 2.0  # and by more than this many standard errors
+
+
+def common_frame(
+    prior: Prior,
+    old: Sequence[ObservedObject],
+    new: Sequence[ObservedObject],
+    config: SceneConfig,
+    rooms: Rooms,
+) -> tuple[Frame, PairFits]:
+    """The frame of a new scan, and how its instances (`new`, own frame) then fit the objects (`old`, scene's)."""
+    height, fits = common_height(prior, old, new, config, rooms) if config.upright else (0.0, None)
+    fits = fits or fit_pairs(prior, old, new, config)
+    lifted = lift(height)
+    pairs = np.argwhere(fits.odds > 0)
+    votes = Votes(
+        T_scene_scan=fits.T_old_new[tuple(pairs.T)] @ lifted,
+        center=np.stack([k.points.mean(axis=0) for k in new])[pairs[:, 1]],
+        object=pairs[:, 0],
+        instance=pairs[:, 1],
+    )
+    T = most_agreed(votes, config.upright, lifted)
+    misfit, before = (room_misfit(x, rooms.scene, rooms.scan) for x in (T, lifted))
+    return Frame(T_scene_scan=T if misfit <= ROOM_WORSE * before else lifted), fits
+
+
+def settled_frame(
+    frame: Frame, places: Sequence[Pose], centers: Points, sigma_m: Sequence[float], upright: bool
+) -> Frame:
+    """The frame by least squares over registered pairs: those that agree with it stayed, as far as is known.
+
+    `places`: T_scene_scan as if the object had not moved, `centers`: mean points (scan's frame), `sigma_m`: errors,
+    one a pair. A frame that was given is kept unless another is clearly better.
+    """
+    every = np.arange(len(places))
+    votes = Votes(T_scene_scan=np.stack(places)[:, None], center=centers, object=every, instance=every)
+    given = with_errors(frame.T_scene_scan, votes, upright)
+    found = estimate(frame.T_scene_scan, votes, upright, np.asarray(sigma_m))
+    here, there = (apply_pose(x.T_scene_scan, centers) for x in (given, found))
+    apart = float(np.sqrt(np.mean(np.sum((here - there) ** 2, axis=1))))
+    as_given = np.array_equal(frame.T_scene_scan, np.eye(4))
+    least = max(GIVEN_M, SURE * position_sigma(found, there)) if as_given else 0.0
+    better = found.cost < (MUCH_LESS * given.cost if as_given else given.cost)
+    best = found if found.agreeing >= FEWEST and better and apart > least else given
+    if best.agreeing < FEWEST:
+        return frame
+    return Frame(
+        T_scene_scan=best.T_scene_scan,
+        sigma_m=position_sigma(best, apply_pose(best.T_scene_scan, centers)),
+        sigma_deg=float(np.rad2deg(np.sqrt(np.trace(best.covariance[3:, 3:])))),
+    )
+
+
+# --- the height ---------------------------------------------------------------------------------------------

@@ -1,0 +1,108 @@
+"""What does not fit is kept and flagged, yet has no part in an object's shape."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from factories import living_scene, turn_z
+from small_scenes import CONFIG, MARK, piece
+
+from more2_jax.geometry.poses import apply_pose
+from more2_jax.network.embedding_batch import embed
+from more2_jax.refinement.joint_of_objects import fit_objects
+from more2_jax.scene import add_scan, reconstruct, start_scene
+from more2_jax.storage.scene_folder import load_scene, save_scene
+from more2_jax.tracking.identify import last_seen
+from more2_jax.tracking.objects import (
+    accumulated,
+    accumulated_points,
+    last_center,
+    new_object,
+    points_of,
+    seen_again,
+)
+from more2_jax.types import Instance, Observation, Scan, SceneObject
+
+TURNED = turn_z(np.pi, np.zeros(3), np.array([2.0, 0.0, 0.0]))  # back to front, elsewhere
+
+
+def seen_twice_and_once_wrongly(prior) -> SceneObject:
+    """A piece seen thrice, of which the second time in a wrong pose that is doubted."""
+    clouds = [piece(0), piece(0) + [1.0, 0, 0], piece(0) + [0, 1.0, 0]]
+    o = new_object(0, 0, Instance(id=1, points=clouds[0]), embed(prior, clouds[:1])[0])
+    right = turn_z(0.0, np.zeros(3), np.array([0, -1.0, 0]))
+    for scan, (T, sure) in enumerate(((TURNED, False), (right, True)), start=1):
+        seen = Observation(
+            scan=scan, instance=1, T_ref_scan=T, score=0.9, rms_m=0.01, converged=True, accumulated=sure
+        )
+        o = seen_again(o, Instance(id=1, points=clouds[scan]), seen)
+    return o
+
+
+def test_doubted_points_are_kept_but_no_part_of_the_shape(tiny_prior):
+    o = seen_twice_and_once_wrongly(tiny_prior)
+    assert [s.scan for s in accumulated(o)] == [0, 2]
+    np.testing.assert_allclose(points_of(o, o.observations[1]), piece(0) + [1.0, 0, 0], atol=1e-9)
+    np.testing.assert_allclose(accumulated_points(o), np.tile(piece(0), (2, 1)), atol=1e-9)
+    np.testing.assert_allclose(last_center(o), piece(0).mean(axis=0) + [0, 1.0, 0], atol=1e-9)
+    known, _ = last_seen(o)
+    np.testing.assert_allclose(known.points, np.tile(piece(0), (2, 1)) + [0, 1.0, 0], atol=1e-9)
+
+
+def test_a_doubted_observation_leaves_the_mesh_as_it_is(tiny_prior):
+    o = dataclasses.replace(seen_twice_and_once_wrongly(tiny_prior), mesh=MARK)
+    again = dataclasses.replace(o.observations[1], scan=3)
+    instance = Instance(id=1, points=piece(0))
+    assert seen_again(o, instance, again).mesh is MARK
+    assert seen_again(o, instance, dataclasses.replace(again, accumulated=True)).mesh is None
+
+
+def test_the_joint_fit_is_that_without_the_doubted_observation(tiny_prior):
+    o = seen_twice_and_once_wrongly(tiny_prior)
+    kept = o.point_scan != 1
+    without = dataclasses.replace(
+        o,
+        observations=(o.observations[0], o.observations[2]),
+        points=o.points[kept],
+        point_scan=o.point_scan[kept],
+    )
+    mine, its = fit_objects(tiny_prior, [o, without], [0, 1], CONFIG)
+    np.testing.assert_allclose(mine.embedding.inv, its.embedding.inv, atol=1e-5)
+    np.testing.assert_array_equal(mine.observations[1].T_ref_scan, TURNED)
+    np.testing.assert_allclose(mine.observations[2].T_ref_scan, its.observations[1].T_ref_scan, atol=1e-5)
+    np.testing.assert_allclose(accumulated_points(mine), its.points, atol=1e-5)
+
+
+@pytest.mark.parametrize(("limit", "sure"), [(0.0, False), (1.0, True)])
+def test_what_fits_worse_than_the_limit_is_left_out(tiny_prior, limit, sure):
+    config = dataclasses.replace(CONFIG, accumulate_misfit=limit)
+    rng = np.random.default_rng(0)
+    noisy = apply_pose(TURNED, piece(0) + rng.normal(0, 0.005, piece(0).shape))
+    scans = [
+        Scan(name=n, source=n, instances=(Instance(id=1, points=p),))
+        for n, p in (("a", piece(0)), ("b", noisy))
+    ]
+    made = add_scan(tiny_prior, start_scene(tiny_prior, scans[0], config), scans[1], config)
+    (o,) = made.objects
+    seen = o.observations[1]
+    assert 0 < seen.misfit < 0.5
+    assert seen.accumulated is sure
+    assert len(accumulated_points(o)) == (2 if sure else 1) * len(piece(0))
+    (whole,) = reconstruct(tiny_prior, made, config).objects
+    assert len(whole.observations) == 2
+    assert made.changes[0].moved == (o.id,)
+
+
+def test_the_flag_comes_back_from_the_folder(tmp_path):
+    scene = living_scene()
+    o = next(o for o in scene.objects if len(o.observations) > 1)
+    doubted = dataclasses.replace(o.observations[1], accumulated=False, misfit=0.7)
+    changed = dataclasses.replace(o, observations=(o.observations[0], doubted, *o.observations[2:]))
+    objects = tuple(changed if x is o else x for x in scene.objects)
+    save_scene(dataclasses.replace(scene, objects=objects), tmp_path / "scene", CONFIG)
+    again, _ = load_scene(tmp_path / "scene")
+    found = next(x for x in again.objects if x.id == o.id)
+    assert (found.observations[1].accumulated, found.observations[1].misfit) == (False, 0.7)
+    np.testing.assert_array_equal(found.points, o.points)

@@ -1,0 +1,124 @@
+"""Fitting how sure a pair is one object."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from known_scenes import known_scene
+from scipy.special import expit
+
+from eval.calibration import (
+    ScanPair,
+    counts,
+    fitted,
+    labels,
+    left_out,
+    log_loss,
+    main,
+    most,
+    scan_pairs,
+    thinned,
+)
+from more2_jax.config import preset
+from more2_jax.matching.calibration import FREE, UNASKED, UPRIGHT, Calibration
+from more2_jax.matching.candidates import fit_pairs
+from more2_jax.network.embedding_batch import embed
+from more2_jax.types import ObservedObject
+
+PLANTED = Calibration(intercept=2.0, nearer=-6.0, farther=0.0, size=-3.0, likeness=4.0, off_less=-5.0)
+
+
+def drawn(room: str, count: int, seed: int, c: Calibration = PLANTED) -> ScanPair:
+    """Pairs whose truth was drawn with the probability that `c` gives them."""
+    rng = np.random.default_rng(seed)
+    names = ("nearer", "farther", "size", "likeness", "lift", "top", "off_less", "off_more")
+    known = {k: rng.uniform(size=count) for k in names}
+    told = c.intercept + sum(getattr(c, k) * v for k, v in known.items())
+    one = rng.random(count) < expit(told)
+    among = np.ones((1, count), bool)
+    return ScanPair(room=room, among=among, known=known, sure=np.ones(count, bool), one=one[None])
+
+
+def test_weights_that_drew_the_truth_are_found_and_evidence_never_speaks_the_wrong_way():
+    found = fitted([drawn("a", 20_000, 0), drawn("b", 20_000, 1)], dataclasses.replace(PLANTED, farther=-1.0))
+    for name, value in dataclasses.asdict(PLANTED).items():
+        assert getattr(found, name) == pytest.approx(value, abs=0.35), name
+    wrong = drawn("c", 20_000, 2, dataclasses.replace(PLANTED, nearer=6.0))
+    assert fitted([wrong], PLANTED).nearer == 0.0
+
+
+def test_only_evidence_that_the_calibration_asks_is_fitted():
+    assert fitted([drawn("a", 500, 0)], UNASKED).off_less == 0.0
+    assert fitted([drawn("a", 500, 0)], FREE).farther == 0.0
+
+
+def test_a_pair_the_prior_knows_nothing_of_teaches_nothing_and_is_weighed_without_it():
+    pair, other = drawn("a", 2000, 0), drawn("b", 100, 1)
+    unsure = dataclasses.replace(other, sure=np.zeros(100, bool))
+    assert fitted([pair, unsure], PLANTED) == fitted([pair], PLANTED)
+    np.testing.assert_array_equal(unsure.odds(FREE), unsure.odds(UNASKED))
+    assert (other.odds(FREE) != other.odds(UNASKED)).all()
+
+
+def test_a_rooms_weights_are_fitted_without_it():
+    pairs = [drawn(room, 2000, k) for k, room in enumerate("aab")]
+    by_room = left_out(pairs, PLANTED)
+    assert by_room == {"a": fitted(pairs[2:], PLANTED), "b": fitted(pairs[:2], PLANTED)}
+
+
+def test_log_loss_by_definition_and_where_odds_are_large():
+    odds, one = np.array([0.3, -2.0, 800.0]), np.array([True, False, False])
+    assert log_loss(odds[:2], one[:2]) == pytest.approx(-np.log(expit(0.3) * (1 - expit(-2.0))) / 2)
+    assert log_loss(odds[2:], one[2:]) == 800.0
+
+
+def test_copies_are_one_object_and_what_a_scan_lacks_is_nothing():
+    scene = known_scene(copies=("a", "b", "b"), scans=2)
+    first, later = (s.instances for s in scene.scans)
+    found = labels(scene, 1, first, later)
+    assert found.tolist() == [[True, False, False], [False, True, True], [False, True, True]]
+    gone = dataclasses.replace(scene, objects=scene.objects[1:])
+    assert not labels(gone, 1, first, later)[0].any()
+
+
+def test_recall_precision_and_f1_of_assignments_by_hand():
+    one = np.array([[True, False, False], [False, True, True], [False, True, True], [False, False, False]])
+    odds = np.array([[2.0, 1.0, -1.0], [-1, 3, -1], [-1, -1, -1], [-1, -1, 1]])
+    assert most(one) == 3
+    recall, precision, f1 = counts([(odds, one), (odds, one)])
+    assert (recall, precision, f1) == pytest.approx((2 / 3, 2 / 3, 2 / 3))
+
+
+def test_thinned_rooms_are_parts_of_the_rooms_and_not_all_the_same():
+    pair = drawn("a", 30, 0)
+    parts = thinned([pair.odds(PLANTED)], [pair])
+    assert len({o.shape for o, _ in parts}) > 1
+    for odds, one in parts:
+        assert odds.shape == one.shape
+        assert np.isin(odds, pair.odds(PLANTED)).all()
+
+
+def test_pairs_are_weighed_as_the_package_weighs_them(tiny_prior):
+    scene = known_scene(copies=("a", "b", "c"), scans=3)
+    config = preset("robust", upright=True)
+    fewer = dataclasses.replace(config.registration, coarse_steps=2, coarse_dense=256, cells=8, yaw_starts=4)
+    config = dataclasses.replace(config, registration=fewer)
+    found = scan_pairs("room", scene, tiny_prior, config)
+    assert len(found) == 2
+    sides = [
+        [ObservedObject(points=i.points, embedding=e) for i, e in zip(scan.instances, codes, strict=True)]
+        for scan in scene.scans
+        for codes in [embed(tiny_prior, [i.points for i in scan.instances])]
+    ]
+    for b, pair in enumerate(found, 1):
+        odds = fit_pairs(tiny_prior, sides[0], sides[b], config).odds
+        np.testing.assert_allclose(pair.odds(UPRIGHT), odds, rtol=1e-3, atol=1e-3)
+
+
+def test_rooms_of_two_kinds_are_refused(tmp_path, monkeypatch):
+    kinds = iter((True, False))
+    monkeypatch.setattr("eval.calibration.flyingshape", lambda _: type("Rooms", (), {"upright": next(kinds)}))
+    with pytest.raises(ValueError, match="needed one kind"):
+        main((tmp_path, tmp_path))

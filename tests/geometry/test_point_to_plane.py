@@ -1,0 +1,160 @@
+"""Surface alignment: normals against planes, steps against displacements, the covariance against repeated noise."""
+
+import jax
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from more2_jax.geometry.point_to_plane import (
+    align,
+    least_axis,
+    moments,
+    pose_covariance,
+    sliding,
+    solve_spd,
+    surface,
+)
+from more2_jax.geometry.points import sample, transformed
+from more2_jax.registration.surface import choose, competing, misfit
+
+POINTS = 256
+
+
+def box_points(rng, size=(1.0, 0.6, 0.4), count=POINTS):
+    """Points on three faces of a box that meet in a corner: no symmetry, and their normals' axes."""
+    axis = rng.integers(0, 3, count)
+    points = rng.uniform(-0.5, 0.5, (count, 3))
+    points[np.arange(count), axis] = 0.5
+    return (points * size).astype(np.float32), axis
+
+
+def as_surface(points, mask=None):
+    mask = np.ones(len(points), bool) if mask is None else mask
+    return surface(sample(jnp.asarray(points, jnp.float32), jnp.asarray(mask), len(points), dense=True))
+
+
+aligned = jax.jit(align, static_argnames=("reach", "steps", "upright"))
+covariance_of = jax.jit(pose_covariance, static_argnames=("reach", "upright"))
+
+
+def test_normals_of_flat_faces_are_their_axes():
+    points, axis = box_points(np.random.default_rng(0), count=1024)
+    normals = np.asarray(as_surface(points).dense_normals)
+    inside = (np.sort(0.5 - np.abs(points) / [1.0, 0.6, 0.4], axis=1)[:, 1]) > 0.2  # away from the edges
+    assert inside.sum() > 100
+    along = np.abs(normals[np.arange(len(points)), axis])[inside]
+    assert along.min() > 0.99
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-4)
+
+
+def test_least_axis_is_that_of_numpy():
+    rng = np.random.default_rng(6)
+    factors = rng.normal(size=(200, 3, 3)) * 10.0 ** rng.uniform(-4, 1, (200, 1, 1)) * [1.0, 0.5, 0.1]
+    matrices = factors @ np.swapaxes(factors, 1, 2)
+    matrices = np.concatenate([matrices, [np.diag([4.0, 1, 0]), np.diag([0, 1.0, 1])]])
+    values, vectors = np.linalg.eigh(matrices)
+    clear = values[:, 1] - values[:, 0] > 0.02 * values[:, 2]
+    got = np.asarray(least_axis(jnp.asarray(matrices, jnp.float32)))
+    assert clear.sum() > 100
+    assert np.abs(np.sum(got * vectors[..., 0], axis=1))[clear].min() > 0.999
+    for degenerate in (np.zeros((3, 3)), np.eye(3), np.diag([1.0, 0, 0])):
+        axis = np.asarray(least_axis(jnp.asarray(degenerate, jnp.float32)))
+        assert np.isfinite(axis).all() and np.linalg.norm(axis) == pytest.approx(1, abs=1e-4)
+    lines = rng.normal(size=(100, 3))
+    lines /= np.linalg.norm(lines, axis=1, keepdims=True)
+    axes = np.asarray(least_axis(jnp.asarray(lines[:, :, None] * lines[:, None], jnp.float32)))
+    assert np.abs(np.sum(axes * lines, axis=1)).max() < 1e-3  # of what lies along a line: across it
+
+
+@pytest.mark.parametrize(
+    ("size", "least"), [(6, 0.1), (42, 42.0), (186, 186.0)]
+)  # of one pose, and of graphs
+def test_elimination_solves_what_numpy_solves(size, least):
+    rng = np.random.default_rng(7)
+    A = rng.normal(size=(size, size))
+    A, b = A @ A.T + least * np.eye(size), rng.normal(size=(size, 2))
+    np.testing.assert_allclose(solve_spd(jnp.asarray(A), jnp.asarray(b)), np.linalg.solve(A, b), rtol=2e-3)
+
+
+def test_sums_of_moments_are_the_normal_equations_of_moved_points():
+    rng = np.random.default_rng(1)
+    points, gap = (jnp.asarray(rng.normal(size=(3, 5)), jnp.float32) for _ in range(2))
+    weight = jnp.asarray(rng.uniform(size=5), jnp.float32)
+    J = jax.jacobian(lambda xi: jaxlie.SE3.exp(xi) @ points.T)(jnp.zeros(6))
+    matrix, vector = sliding(moments(jnp.concatenate([points, gap, jnp.ones((1, 5))]), weight))
+    np.testing.assert_allclose(matrix, jnp.einsum("n,nik,nil->kl", weight, J, J), atol=1e-5)
+    np.testing.assert_allclose(vector, jnp.einsum("n,nik,in->k", weight, J, gap), atol=1e-5)
+
+
+@pytest.mark.parametrize("degrees", [0.0, 1e-4, 179.9, 180.0])
+def test_points_are_moved_as_jaxlie_moves_them(degrees):
+    rng = np.random.default_rng(2)
+    axis = rng.normal(size=3)
+    turn = jaxlie.SO3.exp(jnp.asarray(np.deg2rad(degrees) * axis / np.linalg.norm(axis), jnp.float32))
+    T = jaxlie.SE3.from_rotation_and_translation(turn, jnp.asarray(rng.normal(size=3), jnp.float32))
+    points = jnp.asarray(rng.normal(size=(9, 3)), jnp.float32)
+    np.testing.assert_allclose(transformed(T, points), T @ points, atol=1e-6)
+
+
+@pytest.mark.parametrize("upright", [False, True])
+def test_alignment_recovers_a_displacement_and_upright_never_tilts(upright):
+    points, _ = box_points(np.random.default_rng(2))
+    turn = Rotation.from_euler("z", 12, degrees=True)
+    if not upright:
+        turn = Rotation.from_rotvec(np.deg2rad(12) * np.array([0.6, 0, 0.8]))
+    moved = turn.apply(points) + [0.03, -0.02, 0.04]
+    T = aligned(jaxlie.SE3.identity(), as_surface(points), as_surface(moved), (0.15, 0.02), 25, upright)
+    R = np.asarray(T.rotation().as_matrix())
+    assert np.rad2deg(np.arccos(min(1, (np.trace(R @ turn.as_matrix().T) - 1) / 2))) < 0.5
+    assert np.abs(np.asarray(T.translation()) - [0.03, -0.02, 0.04]).max() < 0.005
+    if upright:
+        np.testing.assert_allclose(R[2], [0, 0, 1], atol=1e-6)
+
+
+def test_degenerate_clouds_give_finite_poses():
+    rng = np.random.default_rng(3)
+    flat = np.c_[rng.normal(size=(64, 2)), np.zeros(64)]
+    line = np.c_[rng.normal(size=64), np.zeros((64, 2))]
+    one = np.zeros((64, 3))
+    for points in (flat, line, one):
+        s = as_surface(points)
+        T = aligned(jaxlie.SE3.identity(), s, s, (0.15, 0.02), 25, False)
+        assert np.isfinite(np.asarray(T.wxyz_xyz)).all()
+        assert np.isfinite(np.asarray(covariance_of(T, s, s, 0.05, False))).all()
+
+
+def test_covariance_is_the_spread_over_repeated_noise_up_to_a_small_factor():
+    rng = np.random.default_rng(4)
+    points, _ = box_points(rng)
+    target, noise, ends, said = as_surface(points), 0.004, [], []
+    for _ in range(12):
+        source = as_surface(points + rng.normal(0, noise, points.shape))
+        T = aligned(jaxlie.SE3.identity(), source, target, (0.15, 0.05), 15, False)
+        ends.append(np.asarray(T.log()))
+        said.append(np.sqrt(np.diagonal(np.asarray(covariance_of(T, source, target, 0.05, False)))))
+    ratio = np.std(ends, axis=0) / np.mean(said, axis=0)
+    assert (ratio > 0.2).all() and (ratio < 5).all()
+
+
+def test_misfit_is_0_of_a_cloud_with_itself_and_1_far_away():
+    s = as_surface(box_points(np.random.default_rng(5))[0])
+    far = jaxlie.SE3.from_translation(jnp.array([10.0, 0, 0]))
+    assert float(misfit(jaxlie.SE3.identity(), s, s, (0.1,))) < 1e-4
+    assert float(misfit(far, s, s, (0.1,))) == pytest.approx(1)
+    lost = jaxlie.SE3(jnp.full(7, jnp.nan))
+    assert float(misfit(lost, s, s, (0.1,))) == 1
+
+
+def test_it_stayed_wins_when_as_good_and_loses_when_worse():
+    assert int(choose(jnp.array([0.2, 0.21]), stayed_is_last=True)) == 1
+    assert int(choose(jnp.array([0.2, 0.5]), stayed_is_last=True)) == 0
+    assert int(choose(jnp.array([0.2, 0.21]), stayed_is_last=False)) == 0
+
+
+def test_only_poses_as_good_and_turned_otherwise_compete():
+    turns = jnp.deg2rad(jnp.array([0.0, 3, 180, 180]))
+    poses = jaxlie.SE3.from_rotation(jax.vmap(jaxlie.SO3.from_z_radians)(turns))
+    found = competing(poses, jnp.array([0.1, 0.1, 0.105, 0.4]), jnp.array(0))
+    assert found.tolist() == [False, False, True, False]

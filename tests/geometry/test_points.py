@@ -1,0 +1,294 @@
+"""Farthest points, nearest neighbours, Kabsch and chamfer against NumPy and SciPy, also where they are ill-posed."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+from scipy.spatial.distance import cdist
+from scipy.spatial.transform import Rotation
+
+from more2_jax.geometry.points import (
+    FAR,
+    Sampled,
+    chamfer_distance,
+    cloud_radius,
+    dominant_eigenvector,
+    evenly,
+    farthest_points,
+    horn_matrix,
+    icp,
+    kabsch,
+    kabsch_rotation,
+    nearest,
+    sample,
+    trimmed,
+    two_way_rms,
+)
+
+RNG = np.random.default_rng(0)
+CLOUD = RNG.normal(size=(50, 3)).astype(np.float32)
+PLANE, LINE = CLOUD * [1, 1, 0], CLOUD * [1, 0, 0]
+POINT = np.zeros((50, 3))
+DEGENERATE = {"plane": PLANE, "line": LINE, "point": POINT}
+
+
+def every(count):
+    return jnp.ones(count, bool)
+
+
+def f32(x):
+    return jnp.asarray(x, jnp.float32)
+
+
+def random_pose(seed):
+    rng = np.random.default_rng(seed)
+    return Rotation.random(random_state=seed).as_matrix(), rng.normal(size=3)
+
+
+# --- farthest points --------------------------------------------------------------------------------------------
+
+
+def farthest_by_definition(points, count):
+    chosen = [0]
+    while len(chosen) < count:
+        chosen.append(int(cdist(points, points[chosen]).min(axis=1).argmax()))
+    return points[chosen]
+
+
+def test_farthest_points_by_definition():
+    got, real = farthest_points(f32(CLOUD), every(50), 20)
+    assert bool(real.all())
+    np.testing.assert_array_equal(got, farthest_by_definition(CLOUD, 20))
+
+
+def test_a_prefix_of_farthest_points_is_the_shorter_sample():
+    long, _ = farthest_points(f32(CLOUD), every(50), 40)
+    short, _ = farthest_points(f32(CLOUD), every(50), 10)
+    np.testing.assert_array_equal(long[:10], short)
+
+
+def test_masked_rows_are_never_chosen_and_change_nothing():
+    garbage = np.concatenate([CLOUD[:30], np.full((20, 3), 1e3)])
+    mask = jnp.arange(50) < 30
+    got, real = farthest_points(f32(garbage), mask, 30)
+    alone, _ = farthest_points(f32(CLOUD[:30]), every(30), 30)
+    assert bool(real.all())
+    np.testing.assert_array_equal(got, alone)
+
+
+def test_duplicates_are_taken_once():
+    got, real = farthest_points(f32(np.tile(CLOUD[:5], (4, 1))), every(20), 12)
+    assert int(real.sum()) == 5
+    np.testing.assert_array_equal(np.unique(got[real], axis=0), np.unique(CLOUD[:5], axis=0))
+    assert set(map(tuple, np.asarray(got))) <= set(map(tuple, CLOUD[:5]))
+
+
+def test_no_points_at_all():
+    got, real = farthest_points(f32(CLOUD), jnp.zeros(50, bool), 4)
+    assert not bool(real.any())
+    assert bool(jnp.isfinite(got).all())
+
+
+# --- nearest ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("n", "m"), [(50, 33), (7, 1), (1, 64), (40, 2048)])
+def test_nearest_is_scipys_up_to_its_ties(n, m):
+    a, b = RNG.normal(size=(n, 3)), RNG.normal(size=(m, 3))
+    _, squared = nearest(f32(a), every(n), f32(b), every(m))
+    expected = cKDTree(b).query(a)[0] ** 2
+    assert (np.asarray(squared) >= expected * (1 - 1e-4) - 1e-6).all()
+    assert (np.asarray(squared) <= expected * (1 + 2.0**-10) + 1e-6).all()
+
+
+def test_nearest_never_chooses_a_masked_row():
+    mask = jnp.asarray([True, False, True])
+    b = f32([[5, 0, 0], [0, 0, 0], [-4, 0, 0]])
+    index, squared = nearest(f32([[0, 0, 0]]), every(1), b, mask)
+    assert (int(index[0]), float(squared[0])) == (2, 16)
+
+
+def test_nearest_of_what_is_not_there_is_far():
+    _, squared = nearest(f32(CLOUD), jnp.arange(50) < 3, f32(CLOUD), every(50))
+    np.testing.assert_array_equal(squared[:3], 0)
+    np.testing.assert_array_equal(squared[3:], np.float32(FAR))
+    _, squared = nearest(f32(CLOUD), every(50), f32(CLOUD), jnp.zeros(50, bool))
+    np.testing.assert_array_equal(squared, np.float32(FAR))
+
+
+# --- trimming and residuals -------------------------------------------------------------------------------------
+
+
+def test_trimmed_keeps_the_smallest_share_of_what_is_real():
+    squared = f32([4, FAR, 1, 3, 2, FAR])
+    assert np.flatnonzero(trimmed(squared, 1.0)).tolist() == [0, 2, 3, 4]
+    assert np.flatnonzero(trimmed(squared, 0.5)).tolist() == [2, 4]
+    assert np.flatnonzero(trimmed(squared, 0.51)).tolist() == [2, 3, 4]
+    assert not bool(trimmed(f32([FAR, FAR]), 0.7).any())
+
+
+def test_two_way_rms_by_definition():
+    a, b = RNG.normal(size=(20, 3)), RNG.normal(size=(31, 3))
+    one, other = (sample(f32(x), every(len(x)), len(x), dense=True) for x in (a, b))
+    distances = cdist(a, b)
+    ways = [np.sqrt(np.mean(distances.min(axis=k) ** 2)) for k in (0, 1)]
+    assert float(two_way_rms(one, other, 1.0)) == pytest.approx(np.mean(ways), rel=1e-3)
+    assert float(two_way_rms(one, one, 1.0)) == pytest.approx(0, abs=1e-6)
+    assert float(two_way_rms(one, other, 0.5)) < np.mean(ways)
+
+
+def test_a_sample_beside_all_or_beside_nothing_more():
+    thin = sample(f32(CLOUD), every(50), 10, dense=False)
+    np.testing.assert_array_equal(thin.points, thin.dense)
+    full = sample(f32(CLOUD), every(50), 10, dense=True)
+    np.testing.assert_array_equal(full.dense, CLOUD)
+    assert isinstance(full, Sampled)
+    np.testing.assert_array_equal(evenly(full, 5).points, CLOUD[::5])
+
+
+def test_chamfer_by_definition_and_blind_to_padding():
+    a, b = RNG.normal(size=(20, 3)), RNG.normal(size=(31, 3))
+    distances = cdist(a, b)
+    expected = distances.min(axis=1).mean() + distances.min(axis=0).mean()
+    assert float(chamfer_distance(f32(a), every(20), f32(b), every(31))) == pytest.approx(expected, rel=1e-3)
+    padded = np.concatenate([a, np.full((12, 3), 77.0)])
+    again = chamfer_distance(f32(padded), jnp.arange(32) < 20, f32(b), every(31))
+    assert float(again) == pytest.approx(expected, rel=1e-3)
+    assert float(chamfer_distance(f32(a), every(20), f32(a), every(20))) == pytest.approx(0, abs=1e-6)
+
+
+def test_chamfer_has_a_finite_gradient_at_coincidence():
+    gradient = jax.grad(lambda x: chamfer_distance(x, every(50), f32(CLOUD), every(50)))(f32(CLOUD))
+    assert bool(jnp.isfinite(gradient).all())
+
+
+# --- Kabsch -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_kabsch_recovers_a_rigid_motion(seed):
+    R, t = random_pose(seed)
+    T = kabsch(f32(CLOUD), f32(CLOUD @ R.T + t), jnp.ones(50))
+    np.testing.assert_allclose(T.rotation().as_matrix(), R, atol=1e-5)
+    np.testing.assert_allclose(T.translation(), t, atol=1e-5)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_kabsch_is_scipys_with_weights_and_noise(seed):
+    rng = np.random.default_rng(seed)
+    R, _ = random_pose(seed)
+    target, weight = CLOUD @ R.T + rng.normal(0, 0.3, CLOUD.shape), rng.uniform(size=50)
+    expected, _ = Rotation.align_vectors(target, CLOUD, weight)
+    got = kabsch_rotation(f32(CLOUD), f32(target), f32(weight))
+    np.testing.assert_allclose(got.as_matrix(), expected.as_matrix(), atol=2e-4)
+
+
+def test_weight_zero_leaves_a_row_out():
+    R, t = random_pose(3)
+    target = CLOUD @ R.T + t
+    target[:5] += 100
+    T = kabsch(f32(CLOUD), f32(target), f32(np.arange(50) >= 5))
+    np.testing.assert_allclose(T.rotation().as_matrix(), R, atol=1e-5)
+
+
+def test_a_reflection_is_answered_by_the_best_rotation():
+    mirrored = CLOUD * [1, 1, -1]
+    got = kabsch_rotation(f32(CLOUD), f32(mirrored)).as_matrix()
+    assert float(jnp.linalg.det(got)) == pytest.approx(1, abs=1e-5)
+    expected, _ = Rotation.align_vectors(mirrored, CLOUD)
+    np.testing.assert_allclose(got, expected.as_matrix(), atol=1e-3)
+
+
+@pytest.mark.parametrize("name", DEGENERATE)
+def test_degenerate_clouds_still_give_a_rotation_that_fits(name):
+    cloud = DEGENERATE[name]
+    R, t = random_pose(5)
+    T = kabsch(f32(cloud), f32(cloud @ R.T + t), jnp.ones(50))
+    matrix = np.asarray(T.rotation().as_matrix())
+    np.testing.assert_allclose(matrix @ matrix.T, np.eye(3), atol=1e-5)
+    assert np.linalg.det(matrix) == pytest.approx(1, abs=1e-5)
+    np.testing.assert_allclose(cloud @ matrix.T + np.asarray(T.translation()), cloud @ R.T + t, atol=1e-4)
+
+
+def test_no_weight_at_all_is_no_motion():
+    T = kabsch(f32(CLOUD), f32(CLOUD + 3), jnp.zeros(50))
+    np.testing.assert_allclose(T.as_matrix(), np.eye(4), atol=1e-6)
+
+
+@pytest.mark.parametrize("cloud", [CLOUD, *DEGENERATE.values()], ids=["cloud", *DEGENERATE])
+def test_the_gradient_of_kabsch_is_finite(cloud):
+    R, t = random_pose(6)
+    target = f32(cloud @ R.T + t)
+    for source, goal in (
+        (f32(cloud), target),
+        (f32(cloud), f32(cloud)),
+        (f32(cloud), f32(cloud * [1, 1, -1])),
+    ):
+        gradient = jax.grad(lambda x, goal=goal: kabsch(x, goal, jnp.ones(50)).as_matrix()[:3].sum())(source)
+        assert bool(jnp.isfinite(gradient).all())
+
+
+def test_the_gradient_of_kabsch_is_the_finite_difference():
+    target = CLOUD[:8] @ random_pose(7)[0].T + 0.1 * RNG.normal(size=(8, 3))
+
+    def loss(x):
+        return jnp.sin(3 * kabsch(x, jnp.asarray(target), jnp.ones(8)).as_matrix()).sum()
+
+    with jax.enable_x64(True):
+        x, direction = jnp.asarray(CLOUD[:8], jnp.float64), jnp.asarray(RNG.normal(size=(8, 3)))
+        slope = float(jnp.sum(jax.grad(loss)(x) * direction))
+        step = 1e-5
+        difference = float(loss(x + step * direction) - loss(x - step * direction)) / (2 * step)
+    assert slope == pytest.approx(difference, rel=1e-5)
+
+
+# --- eigenvectors and axes --------------------------------------------------------------------------------------
+
+
+def test_dominant_eigenvector_is_numpys():
+    for seed in range(20):
+        a = np.random.default_rng(seed).normal(size=(4, 4))
+        a = (a + a.T) / 2
+        values, vectors = np.linalg.eigh(a)
+        if values[3] - values[2] > 0.1:
+            got = np.asarray(dominant_eigenvector(f32(a)))
+            assert abs(got @ vectors[:, 3]) == pytest.approx(1, abs=1e-4)
+
+
+@pytest.mark.parametrize(
+    "matrix",
+    [np.zeros((4, 4)), np.eye(4), -np.eye(4), np.diag([2.0, 2, -1, -3])],
+    ids=["0", "1", "-1", "pair"],
+)
+def test_a_repeated_eigenvalue_gives_a_unit_vector_of_its_space(matrix):
+    got = np.asarray(dominant_eigenvector(f32(matrix)))
+    assert np.linalg.norm(got) == pytest.approx(1, abs=1e-5)
+    np.testing.assert_allclose(matrix @ got, np.linalg.eigvalsh(matrix)[-1] * got, atol=1e-4)
+    assert bool(jnp.isfinite(jax.grad(lambda m: dominant_eigenvector(m).sum())(f32(matrix))).all())
+
+
+def test_horns_matrix_has_no_trace_and_knows_the_identity():
+    h = f32(CLOUD.T @ CLOUD)
+    matrix = np.asarray(horn_matrix(h))
+    np.testing.assert_allclose(matrix, matrix.T)
+    assert np.trace(matrix) == pytest.approx(0, abs=1e-3)
+    np.testing.assert_allclose(np.abs(dominant_eigenvector(jnp.asarray(matrix))), [1, 0, 0, 0], atol=1e-5)
+
+
+def test_radius():
+    assert float(cloud_radius(f32([[1, 0, 0], [-1, 0, 0], [9, 9, 9]]), jnp.asarray([True, True, False]))) == 1
+    assert float(cloud_radius(f32([[7, 7, 7]]), every(1))) == pytest.approx(1e-6)
+
+
+# --- ICP --------------------------------------------------------------------------------------------------------
+
+
+def test_icp_walks_home_from_nearby():
+    R = Rotation.from_rotvec([0.05, -0.1, 0.08]).as_matrix()
+    stretched = CLOUD * [1, 3, 2]
+    source = sample(f32(stretched), every(50), 50, dense=True)
+    target = sample(f32(stretched @ R.T + 0.05), every(50), 50, dense=True)
+    T = icp(kabsch(f32(CLOUD), f32(CLOUD), jnp.ones(50)), source, target, 1.0, 20)
+    np.testing.assert_allclose(T.rotation().as_matrix(), R, atol=1e-3)
+    np.testing.assert_allclose(T.translation(), np.full(3, 0.05), atol=1e-3)

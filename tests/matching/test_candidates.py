@@ -1,0 +1,171 @@
+"""Who is who by geometry: what is assigned, what is left over and how surely, and which copies are interchangeable."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+import pytest
+from scipy.special import expit
+
+from more2_jax.config import preset
+from more2_jax.geometry.point_to_plane import coarsened, whole_surface
+from more2_jax.matching.assignment import NEVER, assign, interchangeable, unmatched
+from more2_jax.matching.calibration import (
+    FREE,
+    HIGHEST,
+    UNASKED,
+    UNKNOWN,
+    UPRIGHT,
+    Calibration,
+    Compared,
+    calibrated,
+    log_odds,
+)
+from more2_jax.matching.candidates import fit_pairs, proposed
+from more2_jax.matching.pair_evidence import Evidence, pair_evidence
+from more2_jax.network.embedding_batch import at_zero, embed, padded, stack, with_origin
+from more2_jax.network.prior import load_prior
+from more2_jax.registration.starting_poses import Pair
+from more2_jax.registration.surface import LIFTED, off_field, off_fields
+from more2_jax.types import ObservedObject
+
+STILL = np.zeros((3, 3))
+
+
+def box(rng, size, count=600):
+    """Points on the surface of a box that stands on z = 0."""
+    points = rng.uniform(-0.5, 0.5, (count, 3))
+    points[np.arange(count), rng.integers(0, 3, count)] = rng.choice([-0.5, 0.5], count)
+    return points * size + [0, 0, size[2] / 2]
+
+
+def test_only_what_is_likelier_one_than_two_is_matched():
+    odds = np.array([[2.0, 1.0], [3.0, -0.5], [-1.0, -2.0]])
+    assert assign(odds, np.zeros((3, 2)), 0.0).tolist() == [[0, 1], [1, 0]]
+    assert assign(-np.abs(odds), np.zeros((3, 2)), 0.0).tolist() == []
+    assert assign(np.full((2, 2), NEVER), np.zeros((2, 2)), 1.0).tolist() == []
+
+
+def test_of_identical_copies_each_stays_as_near_as_can_be_and_is_flagged():
+    odds = np.array([[3.0, 3.1, -4], [3.1, 3.0, -4], [-4, -4, 3.0]])
+    moved = np.array([[0.0, 3.0, 9], [3.0, 0.0, 9], [9, 9, 0.0]])
+    pairs = assign(odds, moved, 0.2)
+    assert pairs.tolist() == [[0, 0], [1, 1], [2, 2]]
+    assert assign(odds, moved, 0.0).tolist() == [[0, 1], [1, 0], [2, 2]]
+    assert interchangeable(odds, pairs) == [True, True, False]
+
+
+def test_a_copy_that_went_makes_the_other_interchangeable_and_far_motion_alone_rejects_none():
+    odds = np.array([[3.0, -4], [2.9, -4]])
+    pairs = assign(odds, np.array([[1.0, 5], [100.0, 5]]), 0.2)
+    assert pairs.tolist() == [[0, 0]]
+    assert interchangeable(odds, pairs) == [True]
+    assert assign(np.array([[0.5]]), np.array([[100.0]]), 0.2).tolist() == [[0, 0]]
+
+
+def test_log_odds_are_linear_and_the_two_ways_have_no_order():
+    rng = np.random.default_rng(0)
+    values = {k: rng.uniform(size=3) for k in ("of_source", "of_target", "off_source", "off_target", "lift")}
+    evidence = Evidence(radius=np.full(3, 0.5), poses=None, off_own=np.zeros(3), **values)
+    known = Compared(**{k: rng.uniform(size=3) for k in ("size", "likeness", "top_m", "color")})
+    c = Calibration(
+        intercept=1.0,
+        nearer=2.0,
+        farther=3.0,
+        size=4.0,
+        likeness=5.0,
+        lift=6.0,
+        top=7.0,
+        off_less=8.0,
+        off_more=9.0,
+    )
+    by_hand = 1 + 4 * known.size + 5 * known.likeness + known.color
+    by_hand += 6 * np.minimum(values["lift"] / (LIFTED * 0.5), 1) + 7 * np.minimum(known.top_m / 0.5, HIGHEST)
+    for k, less, more in (("of", 2, 3), ("off", 8, 9)):
+        a, b = values[f"{k}_source"], values[f"{k}_target"]
+        by_hand += less * np.minimum(a, b) + more * np.maximum(a, b)
+    np.testing.assert_allclose(log_odds(evidence, known, c), by_hand)
+
+
+def test_the_prior_is_asked_in_any_orientation_alone_and_only_where_it_knows_the_clouds():
+    rng = np.random.default_rng(0)
+    fields = ("of_source", "of_target", "off_source", "off_target", "lift")
+    evidence = Evidence(
+        radius=np.full(3, 0.5),
+        poses=None,
+        off_own=np.array([0.0, UNKNOWN, UNKNOWN + 0.1]),
+        **{k: rng.uniform(size=3) for k in fields},
+    )
+    known = Compared(**{k: rng.uniform(size=3) for k in ("size", "likeness", "top_m", "color")})
+    upright, free = (preset("robust", upright=u).registration for u in (True, False))
+    by = {c: log_odds(evidence, known, c) for c in (UPRIGHT, FREE, UNASKED)}
+    np.testing.assert_array_equal(calibrated(evidence, known, upright, True), by[UPRIGHT])
+    found = calibrated(evidence, known, free, False)
+    np.testing.assert_array_equal(found, [*by[FREE][:2], by[UNASKED][2]])
+    without = dataclasses.replace(free, field_weight=0.0)
+    np.testing.assert_array_equal(calibrated(evidence, known, without, False), by[UNASKED])
+    assert not (UPRIGHT.off_less or UPRIGHT.off_more or UNASKED.off_less or UNASKED.off_more)
+
+
+def test_in_any_orientation_the_evidence_is_that_of_the_best_pose(tiny_prior):
+    rng = np.random.default_rng(3)
+    clouds = [box(rng, np.array([1.0, 0.5, 0.6]), 200) + [k, 0, 0] for k in range(2)]
+    cloud = padded(clouds)
+    codes = at_zero(with_origin(stack(embed(tiny_prior, clouds))[0], np.asarray(cloud.origin)))
+    flat = dataclasses.replace(cloud, origin=jnp.zeros((len(cloud.points), 3)))
+    config = dataclasses.replace(preset("robust").registration, coarse_steps=4, coarse_dense=256, cells=8)
+    offset, pairs = jnp.zeros((len(cloud.points),) * 2 + (3,)), jnp.array([[0, 1]])
+    found = pair_evidence(tiny_prior, flat, flat, codes, codes, offset, pairs, config, False)
+    T = jax.tree.map(lambda x: x[0], found.poses)
+    surfaces = [coarsened(whole_surface(cloud.points[k], cloud.mask[k]), 128, 256, 8) for k in range(2)]
+    sampled = [s.sampled for s in surfaces]
+    a, b = (jax.tree.map(lambda x, k=k: jnp.asarray(x)[k], codes) for k in range(2))
+    pair = Pair(source=sampled[0], target=sampled[1], source_code=a, target_code=b, offset=jnp.zeros(3))
+    off = off_fields(tiny_prior, T, pair, surfaces)
+    np.testing.assert_allclose([found.off_source[0], found.off_target[0]], off[0], atol=1e-3)
+    stay = jaxlie.SE3.identity()
+    own = [off_field(tiny_prior, stay, c, e) for c, e in ((sampled[0], a), (sampled[1], b))]
+    np.testing.assert_allclose(found.off_own[0], max(own), atol=1e-3)
+
+
+def test_what_is_left_over_is_gone_unless_another_left_over_may_be_it():
+    odds = np.array([[2.0, -1.0, -2.0], [-3.0, -1.0, NEVER]])
+    gone, new = unmatched(odds, np.array([[0, 0]]))
+    assert gone == {1: pytest.approx(1 - expit(-1.0))}
+    assert new == {1: pytest.approx(1 - expit(-1.0)), 2: pytest.approx(1.0)}
+
+
+def test_every_row_and_column_proposes_its_best():
+    score = np.random.default_rng(0).normal(size=(6, 9))
+    chosen = proposed(score, 2)
+    for matrix, picked in ((score, chosen), (score.T, chosen.T)):
+        for row, mine in zip(matrix, picked, strict=True):
+            assert mine[np.argsort(-row)[:2]].all()
+    assert chosen.sum() < score.size
+    assert proposed(score, 0).all()
+
+
+def test_geometry_tells_boxes_of_one_size_but_different_shape_apart(tiny_prior):
+    rng = np.random.default_rng(1)
+    wide, tall = np.array([1.0, 0.5, 0.6]), np.array([0.5, 0.6, 1.0])  # the same box, on another face
+    first = [box(rng, wide) + [5, 0, 0], box(rng, tall)]
+    second = [box(rng, tall) + [2, 2, 0], box(rng, wide) + [0, 3, 0]]
+    known = [
+        [
+            ObservedObject(points=p, embedding=e)
+            for p, e in zip(clouds, embed(tiny_prior, clouds), strict=True)
+        ]
+        for clouds in (first, second)
+    ]
+    odds = fit_pairs(tiny_prior, known[0], known[1], preset("robust", upright=True)).odds
+    assert odds.shape == (2, 2)
+    assert min(odds[0, 1], odds[1, 0]) > max(odds[0, 0], odds[1, 1]) + 1
+
+
+def test_records_of_another_encoder_are_refused_where_the_prior_has_a_say(tiny_prior):
+    cloud = box(np.random.default_rng(0), np.array([1.0, 0.5, 0.6]))
+    known = [ObservedObject(points=cloud, embedding=embed(tiny_prior, [cloud])[0])]
+    with pytest.raises(ValueError, match=r"match got embeddings with 0 levels of anchors.*needed 2"):
+        fit_pairs(load_prior("small"), known, known, preset("robust"))

@@ -1,0 +1,164 @@
+"""The look-up around a query is the sum it says it is, moves with the object, and pads without a trace."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+import pytest
+from compiling import quick_jit
+from places import ROOT
+
+from more2_jax.config import TrainingRun, load_config
+from more2_jax.geometry.transform import move_embedding, scale_embedding
+from more2_jax.network.local_field import LEAST_SPREAD, LocalLookup, from_plane, local_width
+from more2_jax.network.prior import encode_one, init_prior, sdf_one
+from more2_jax.types import Anchors
+
+CHANNELS, BANDWIDTHS, INPUTS = 4, (0.1, 0.3), 6
+encoded, distance = jax.jit(encode_one), jax.jit(sdf_one)
+
+
+def random_anchors(count: int, seed: int = 0) -> Anchors:
+    k_offset, k_features = jax.random.split(jax.random.key(seed))
+    features = jax.random.normal(k_features, (count, 3, INPUTS))
+    return Anchors(
+        offset=0.4 * jax.random.normal(k_offset, (count, 3)),
+        features=features / jnp.linalg.norm(features, axis=(-2, -1), keepdims=True),
+        mask=jnp.ones(count, bool),
+    )
+
+
+@pytest.fixture(scope="module")
+def lookup():
+    module = LocalLookup(CHANNELS, BANDWIDTHS, INPUTS)
+    params = module.init(jax.random.key(1), random_anchors(5), jnp.float32(1.0), method="fold")
+
+    @jax.jit
+    def asked(params, anchors: Anchors, scale: jax.Array, q: jax.Array) -> jax.Array:
+        bound = module.bind(params)
+        return bound.ask(bound.fold(anchors, scale), q)
+
+    def ask(anchors: Anchors, scale: float, q: np.ndarray) -> np.ndarray:
+        return np.asarray(asked(params, anchors, jnp.float32(scale), jnp.asarray(q, jnp.float32)))
+
+    return params["params"], ask
+
+
+def one_by_one(params, anchors: Anchors, scale: float, q: np.ndarray) -> np.ndarray:
+    """Every query and every anchor in a loop, offsets taken by subtraction, float64."""
+    slope, left, right = (np.asarray(params[k], np.float64) for k in ("slope", "left", "right"))
+    real = np.flatnonzero(anchors.mask)
+    positions = np.asarray(anchors.offset, np.float64)[real] / scale
+    features = np.asarray(anchors.features, np.float64)[real] * np.sqrt(INPUTS)
+    rows = []
+    for p in q:
+        row = []
+        for h, bandwidth in enumerate(np.exp(np.asarray(params["log_bandwidth"], np.float64))):
+            columns = slice(h * CHANNELS, (h + 1) * CHANNELS)
+            exponent = np.array([-((p - x) @ (p - x)) / (2 * bandwidth**2) for x in positions])
+            w = np.exp(exponent - exponent.max())  # the largest is 1: far away all would underflow
+            w /= w.sum()
+            slopes = [f @ slope[:, columns] for f in features]
+            constants = [((f @ left[:, columns]) * (f @ right[:, columns])).sum(axis=0) / 3 for f in features]
+            linear = sum(k * ((p - x) @ b) for k, x, b in zip(w, positions, slopes, strict=True))
+            constant = sum(k * c for k, c in zip(w, constants, strict=True))
+            mean = w @ positions
+            covariance = np.einsum("a,ai,aj->ij", w, positions - mean, positions - mean)
+            spread = max(np.trace(covariance), LEAST_SPREAD)
+            across = p - mean - 2 * covariance @ (p - mean) / spread
+            distance = np.sqrt((p - mean) @ (p - mean) + spread)
+            height = np.linalg.norm(across)
+            blended = sum(k * b for k, b in zip(w, slopes, strict=True))
+            row += [
+                *(linear / (distance + bandwidth) + constant),
+                distance,
+                distance / (distance + bandwidth),
+            ]
+            row += [*(across @ blended / (height + 0.02)), height, height / (height + 0.02), np.sqrt(spread)]
+        rows.append(row)
+    return np.array(rows)
+
+
+def test_blend_is_the_normalised_sum_over_anchors(lookup):
+    params, ask = lookup
+    q = np.random.default_rng(0).uniform(-0.6, 0.6, (20, 3))
+    anchors = random_anchors(30)
+    got = ask(anchors, 1.3, q)
+    assert got.shape == (20, local_width(CHANNELS, len(BANDWIDTHS)))
+    np.testing.assert_allclose(got, one_by_one(params, anchors, 1.3, q), atol=2e-4)
+
+
+def test_masked_anchors_change_nothing(lookup):
+    _, ask = lookup
+    q = np.random.default_rng(1).uniform(-0.6, 0.6, (10, 3))
+    few = random_anchors(12)
+    junk = random_anchors(7, seed=5)
+    more = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), few, junk)
+    more = dataclasses.replace(more, mask=jnp.arange(19) < 12)
+    np.testing.assert_allclose(ask(more, 1.0, q), ask(few, 1.0, q), atol=1e-5)
+
+
+def test_duplicate_anchors_count_as_weight_and_stay_finite(lookup):
+    params, ask = lookup
+    one = jax.tree.map(lambda x: jnp.repeat(x[:1], 9, axis=0), random_anchors(1))
+    q = np.concatenate([np.asarray(one.offset[:1]), [[0.0, 0.0, 0.0], [50.0, 0.0, 0.0]]])
+    got = ask(one, 1.0, q)
+    assert np.isfinite(got).all()
+    single = jax.tree.map(lambda x: x[:1], one)
+    np.testing.assert_allclose(got[1:], one_by_one(params, single, 1.0, q)[1:], rtol=2e-3, atol=2e-3)
+
+
+def test_across_is_the_signed_distance_from_a_plane():
+    """Anchors evenly on z = 0: what lies in the plane goes, what stands on it stays."""
+    disc = np.random.default_rng(0).normal(size=(20_000, 3)) * [0.1, 0.1, 0.0]
+    q = np.array([[0.05, -0.08, 0.03], [0.2, 0.0, -0.01], [0.0, 0.0, 0.0]])
+    second = np.einsum("ai,aj->ij", disc, disc) / len(disc)
+    tiled = (jnp.asarray(np.tile(x, (3, *[1] * x.ndim)), jnp.float32) for x in (disc.mean(axis=0), second))
+    _, across, spread = from_plane(jnp.asarray(q, jnp.float32), *tiled)
+    np.testing.assert_allclose(across, q * [0, 0, 1], atol=3e-3)
+    np.testing.assert_allclose(spread, 0.02, rtol=0.03)
+
+
+@pytest.fixture(scope="module")
+def prior():
+    config = load_config(ROOT / "configs" / "small.yaml", TrainingRun).model
+    assert config.decoder.local_blocks  # or the tests below say nothing
+    return init_prior(config, jax.random.key(3))
+
+
+@pytest.fixture(scope="module")
+def cloud():
+    return jnp.asarray(np.random.default_rng(4).uniform(-0.5, 0.5, (200, 3)) * [1.0, 0.6, 0.4], jnp.float32)
+
+
+def test_field_moves_and_grows_with_the_cloud(prior, cloud):
+    """SDF(sRp + t; Φ(sRX + t)) = SDF(p; Φ(X)): encoding the moved cloud or moving its embedding."""
+    T = jaxlie.SE3.from_rotation_and_translation(
+        jaxlie.SO3.sample_uniform(jax.random.key(0)), jnp.array([3.0, -2.0, 1.0])
+    )
+    mask, queries = jnp.ones(len(cloud), bool), 1.2 * cloud[:40]
+    embedding = encoded(prior, cloud, mask)
+    expected = distance(prior, embedding, queries)
+    assert np.ptp(expected) > 0.01
+    moved = jax.vmap(lambda p: T @ (2.5 * p))
+    again = encoded(prior, moved(cloud), mask)
+    np.testing.assert_allclose(distance(prior, again, moved(queries)), expected, atol=5e-4)
+    carried = move_embedding(scale_embedding(embedding, jnp.float32(2.5)), T)
+    np.testing.assert_allclose(distance(prior, carried, moved(queries)), expected, atol=1e-4)
+
+
+def test_gradients_are_finite_with_few_real_points(prior, cloud):
+    mask = jnp.arange(len(cloud)) < 20
+
+    def total(params, points, mask):
+        weights = dataclasses.replace(prior, params=params)
+        return jnp.abs(sdf_one(weights, encode_one(weights, points, mask), points[:30])).sum()
+
+    gradient = quick_jit(jax.grad(total, argnums=(0, 1)))(prior.params, cloud, mask)
+    gradient = jax.device_get(gradient)
+    assert all(np.isfinite(g).all() for g in jax.tree.leaves(gradient))
+    assert float(np.abs(gradient[0]["decoder"]["local_1"]["slope"]).max()) > 0

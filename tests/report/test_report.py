@@ -1,0 +1,361 @@
+"""The page stands alone, says what the scene says, shows names from files as text, and keeps to its size."""
+
+import base64
+import dataclasses
+import gzip
+import json
+import re
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+from factories import WORLD_M, cube, living_scene, scene_object, turn_z
+from scipy.spatial.transform import Rotation
+from skimage.color import rgb2lab
+
+from more2_jax.config import SceneConfig
+from more2_jax.geometry.poses import apply_pose
+from more2_jax.report import color, motion_text, report_html, rgb, write_report
+from more2_jax.report.blob import Blob
+from more2_jax.report.coverage import coverage
+from more2_jax.report.palette import BASE, ink
+from more2_jax.report.payload import payload
+from more2_jax.report.wording import Verdict, headline, phrase, verdict
+from more2_jax.tracking.objects import points_of
+from more2_jax.types import Changes
+
+SCENE, CONFIG = living_scene(), SceneConfig()
+
+
+class Page(HTMLParser):
+    """Tables as rows of text, buttons of objects, scripts; every tag opened must be closed."""
+
+    VOID = ("meta", "input", "br")
+
+    def __init__(self, page: str) -> None:
+        super().__init__()
+        self.rows: list[list[str]] = []
+        self.buttons: dict[str, str] = {}
+        self.scripts: list[str] = []
+        self.elements: list[tuple[str, dict[str, str | None]]] = []
+        self.open: list[str] = []
+        self.button = ""
+        self.feed(page)
+        assert self.open == []
+
+    def handle_starttag(self, tag, attrs):
+        self.elements.append((tag, dict(attrs)))
+        if tag not in self.VOID:
+            self.open.append(tag)
+        if tag == "tr":
+            self.rows.append([])
+        if tag in ("td", "th"):
+            self.rows[-1].append("")
+        if tag == "script":
+            self.scripts.append("")
+        if tag == "button" and (name := dict(attrs).get("data-id")):
+            self.button = name
+            self.buttons[name] = ""
+
+    def handle_endtag(self, tag):
+        if tag not in self.VOID:
+            assert self.open.pop() == tag
+        if tag == "button":
+            self.button = ""
+
+    def handle_data(self, data):
+        if "td" in self.open or "th" in self.open:
+            self.rows[-1][-1] += data
+        if self.button:
+            self.buttons[self.button] += data + "|"
+        if "script" in self.open:
+            self.scripts[-1] += data
+
+
+def page_of(scene=SCENE) -> Page:
+    return Page(report_html(scene, CONFIG))
+
+
+def test_the_room_and_every_object_are_told(tmp_path):
+    write_report(SCENE, tmp_path / "report.html", CONFIG)
+    text = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert "Between monday and friday: 1 object moved, 1 was added, 1 was removed, 2 stayed." in text
+    assert "Between tuesday and friday: 1 object was added, 3 stayed." in text
+    page = Page(text)
+    assert page.buttons["object_000"].startswith(
+        "0|table|stayed where it was|unsure|match 0.90 · 150 points · "
+    )
+    assert re.search(r"moved by \d\.\d\d m and turned by 90°", page.buttons["object_001"])
+    assert page.buttons["object_002"].startswith("2|object 2|removed|unsure|in one scan only · 50 points · ")
+    assert page.buttons["object_003"].startswith("3|object 3|added|")
+    assert "no surface" in page.buttons["object_004"]
+    assert ["tuesday", "instance 5", "9 points; needed 64"] in page.rows
+    assert ["Finding how it moved", "", "3.0 s"] in page.rows
+    assert page.rows[-1] == ["All", "", "7.8 s"]
+
+
+def test_motion_is_that_of_the_definition():
+    """T_scan1_ref alone says where the object's middle went: the reference observation is scan 0."""
+    o = SCENE.objects[1]
+    T = np.linalg.inv(o.observations[1].T_ref_scan)
+    middle = o.points.mean(axis=0)
+    moved = np.linalg.norm(T[:3, :3] @ middle + T[:3, 3] - middle)
+    assert motion_text(o, SCENE.changes[0]) == f"moved {moved:.2f} m, 90.0°"
+
+
+def test_nothing_is_loaded_from_anywhere():
+    page = page_of()
+    loading = {"src", "href", "action", "srcset", "data"}
+    assert [e for e in page.elements if loading & set(e[1]) and e[1].get("href") != "#list"] == []
+    assert not {e[0] for e in page.elements} & {"link", "img", "iframe", "object", "embed"}
+    policy = next(e[1]["content"] for e in page.elements if e[1].get("http-equiv"))
+    assert policy == "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'"
+
+
+@pytest.mark.parametrize(
+    "evil", ["<script>alert(1)</script>", '"><img src=x onerror=y>', "$title ${x} & </script>"]
+)
+def test_names_from_files_are_shown_as_text(evil):
+    o = dataclasses.replace(SCENE.objects[0], label=evil)
+    scans = tuple(dataclasses.replace(s, name=evil) for s in SCENE.scans)
+    skipped = dataclasses.replace(SCENE.scans[1].skipped[0], what=evil, reason=evil)
+    scans = (scans[0], dataclasses.replace(scans[1], skipped=(skipped,)), scans[2])
+    page = page_of(dataclasses.replace(SCENE, objects=(o, *SCENE.objects[1:]), scans=scans, prior=evil))
+    assert [e[0] for e in page.elements] == [e[0] for e in page_of().elements]
+    assert [evil, evil, evil] in page.rows
+    assert json.loads(page.scripts[0])["objects"][0]["name"] == evil
+
+
+# --- words --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("distance", "angle", "says"),
+    [
+        (1.2, 35.0, "moved by 1.20 m and turned by 35°"),
+        (0.3, 0.2, "moved by 30 cm"),
+        (0.004, 90.0, "turned by 90°"),
+    ],
+)
+def test_motion_in_words(distance, angle, says):
+    assert phrase(Verdict(status="moved", distance_m=distance, angle_deg=angle)) == says
+
+
+def doubtful(**seen) -> Verdict:
+    o = SCENE.objects[1]
+    worse = dataclasses.replace(o.observations[1], **{"interchangeable": False} | seen)
+    return verdict(dataclasses.replace(o, observations=(o.observations[0], worse)), SCENE.changes[0])
+
+
+def test_a_change_of_little_probability_is_told_as_unsure():
+    o, changes = SCENE.objects[0], SCENE.changes[0]
+    for chance, doubts in ((0.9, 0), (0.55, 1)):
+        found = verdict(o, dataclasses.replace(changes, probability={o.id: chance}))
+        assert len(found.doubts) == doubts and all("probability of 55%" in d for d in found.doubts)
+
+
+def test_doubts_are_told():
+    assert doubtful().doubts == ()
+    assert doubtful(converged=False).doubts == ("its new position did not settle",)
+    assert "match score 0.20" in doubtful(score=0.2).doubts[0]
+    assert len(doubtful(score=-1.0, converged=False).doubts) == 2
+    assert doubtful(interchangeable=True).doubts == (
+        "it may have changed places with a piece that looks the same",
+    )
+    assert "left out of its shape" in doubtful(accumulated=False).doubts[0]
+    assert headline(SCENE, [doubtful(score=0.2)], 0, 1).endswith("1 object moved. 1 of these is unsure.")
+
+
+def test_the_reference_observation_is_beyond_doubt():
+    o = SCENE.objects[2]
+    odd = dataclasses.replace(o, observations=(dataclasses.replace(o.observations[0], score=0.0),))
+    assert verdict(odd, SCENE.changes[0]).doubts == ()
+
+
+def test_nobody_in_either_scan():
+    absent = verdict(SCENE.objects[2], SCENE.changes[1])
+    assert phrase(absent) == "not here"
+    assert "no object is in either" in headline(SCENE, [absent], 1, 2)
+
+
+def test_first_and_last_are_compared_by_the_settings():
+    """From scan 0 to 2 the scene has no changes stored: object 1 moved 90° there, unless that counts as still."""
+    lenient = dataclasses.replace(CONFIG, static_deg=180.0, static_m=100.0)
+    assert payload(SCENE, CONFIG)[0]["pairs"]["0-2"]["verdicts"][1]["status"] == "moved"
+    assert payload(SCENE, lenient)[0]["pairs"]["0-2"]["verdicts"][1]["status"] == "static"
+
+
+# --- what goes into the page --------------------------------------------------------------------------------
+
+
+def unpacked(text: str) -> bytes:
+    return gzip.decompress(base64.b64decode(text))
+
+
+def array_of(data: bytes, reference: dict) -> np.ndarray:
+    return np.frombuffer(
+        data, "<" + {"uint16": "u2", "uint32": "u4"}[reference["type"]], reference["count"], reference["at"]
+    )
+
+
+def points_back(data: bytes, reference: dict) -> np.ndarray:
+    return np.array(reference["low"]) + reference["step"] * array_of(data, reference).reshape(-1, 3)
+
+
+def test_points_come_back_to_half_a_step():
+    rng = np.random.default_rng(0)
+    clouds = [rng.normal(size=(n, 3)) * [1, 20, 0.1] for n in (1, 3, 1000)]
+    blob = Blob()
+    references = [blob.add_points(c) for c in clouds]
+    data = unpacked(blob.text())
+    for cloud, reference in zip(clouds, references, strict=True):
+        assert reference["at"] % 4 == 0
+        assert np.abs(points_back(data, reference) - cloud).max() <= 0.5001 * reference["step"]
+        assert reference["step"] <= np.ptp(cloud, axis=0).max() / 65535 + 1e-9
+    with pytest.raises(ValueError, match="array of float64"):
+        blob.add(np.zeros(3))
+
+
+def test_the_page_puts_every_observation_where_the_scan_saw_it():
+    """Poses and quantised clouds of the payload, composed as three.js does, give the scans' points back."""
+    data, text = payload(SCENE, CONFIG)
+    blob = unpacked(text)
+    clouds = [points_of(o, s) for o in SCENE.objects for s in o.observations]
+    low, high = (f(np.concatenate(clouds), axis=0) for f in (np.min, np.max))
+    for o, shown in zip(SCENE.objects, data["objects"], strict=True):
+        start = np.cumsum([0, *shown["counts"]])
+        local = points_back(blob, shown["cloud"])
+        for k, seen in enumerate(shown["observations"]):
+            R = Rotation.from_quat(seen["quaternion"])
+            placed = R.apply(local[start[k] : start[k + 1]]) + seen["position"] + (low + high) / 2
+            expected = points_of(o, o.observations[k])
+            order = [np.lexsort(np.round(p, 2).T) for p in (placed, expected)]
+            nearest = np.linalg.norm(placed[:, None] - expected[None], axis=-1).min(axis=1)
+            assert nearest.max() < 1e-4
+            assert len(order[0]) == len(order[1]) == 50
+        if o.mesh is not None:
+            faces = array_of(blob, shown["mesh"]["faces"]).reshape(-1, 3)
+            np.testing.assert_array_equal(faces, o.mesh.faces)
+            vertices = points_back(blob, shown["mesh"]["vertices"]) + o.points.mean(axis=0)
+            np.testing.assert_allclose(vertices, o.mesh.vertices, atol=1e-4)
+
+
+def test_backgrounds_go_in_with_their_scan():
+    ground = np.random.default_rng(1).uniform(-2, 2, (500, 3)) + WORLD_M
+    scans = (dataclasses.replace(SCENE.scans[0], background=ground), *SCENE.scans[1:])
+    data, text = payload(dataclasses.replace(SCENE, scans=scans), CONFIG)
+    assert [s["background"] is None for s in data["scans"]] == [False, True, True]
+    shown = points_back(unpacked(text), data["scans"][0]["background"])
+    np.testing.assert_allclose(np.ptp(shown, axis=0), np.ptp(ground, axis=0), atol=1e-3)
+
+
+@pytest.mark.parametrize("points", [1, 2])
+def test_one_scan_with_hardly_a_point(points):
+    o = scene_object(0, {0: np.eye(4)}, mesh=False)
+    o = dataclasses.replace(o, points=o.points[:1].repeat(points, 0), point_scan=np.zeros(points, int))
+    scene = dataclasses.replace(SCENE, objects=(o,), scans=SCENE.scans[:1], changes=())
+    page = report_html(scene, CONFIG)
+    assert "monday: 1 object found." in page
+    assert "One scan only: nothing to compare." in page
+    assert not re.search(r"\b(nan|inf|NaN|Infinity)\b", Page(page).scripts[0])
+
+
+def test_no_objects_no_page():
+    with pytest.raises(ValueError, match="no objects"):
+        report_html(dataclasses.replace(SCENE, objects=()), CONFIG)
+
+
+def test_a_large_scene_is_thinned_and_keeps_to_its_size():
+    """Ten million points and half a million faces still make a page below 15 MB; everything remains a little."""
+    o = scene_object(0, {0: np.eye(4), 1: turn_z(1.0, WORLD_M, np.ones(3))})
+    rng = np.random.default_rng(0)
+    many = dataclasses.replace(
+        o, points=WORLD_M + rng.uniform(size=(10**6, 3)), point_scan=np.repeat([0, 1], 5 * 10**5)
+    )
+    objects = [dataclasses.replace(many, id=f"object_{k:03d}", mesh=None) for k in range(3)]
+    scene = dataclasses.replace(
+        SCENE, objects=(*objects, o), changes=(Changes(from_scan=0, to_scan=1),), scans=SCENE.scans[:2]
+    )
+    data, text = payload(scene, CONFIG)
+    assert sum(sum(shown["counts"]) for shown in data["objects"]) <= 500_002
+    assert min(min(shown["counts"]) for shown in data["objects"]) >= 1
+    assert len(text) < 5e6
+
+
+def test_coverage_of_a_cube_is_the_share_of_sides_seen():
+    rng = np.random.default_rng(0)
+    mesh = cube(np.zeros(3))
+    top = np.c_[rng.uniform(-0.5, 0.5, (4000, 2)), np.full(4000, 0.5)]
+    # One side of six, and of the four beside it a rim of 3 % of the diagonal: 1/6 + 4/6 · 0.052
+    assert coverage(mesh, top) == pytest.approx(1 / 6 + 4 / 6 * 0.03 * 3**0.5, abs=0.02)
+    sides = [np.roll(top * [1, 1, s], k, axis=1) for k in range(3) for s in (1, -1)]
+    assert coverage(mesh, np.concatenate(sides)) == 1.0
+    assert coverage(mesh, np.zeros((0, 3))) == 0.0
+    assert coverage(mesh, top[:1] + 5) == 0.0
+
+
+# --- colours ------------------------------------------------------------------------------------------------
+
+# Machado, Oliveira & Fernandes 2009, severity 1, on linear RGB.
+SEEN_BY = {
+    "protan": [
+        [0.152286, 1.052583, -0.204868],
+        [0.114503, 0.786281, 0.099216],
+        [-0.003882, -0.048116, 1.051998],
+    ],
+    "deutan": [
+        [0.367322, 0.860646, -0.227968],
+        [0.280085, 0.672501, 0.047413],
+        [-0.01182, 0.04294, 0.968881],
+    ],
+    "tritan": [
+        [1.255528, -0.076749, -0.178779],
+        [-0.078411, 0.930809, 0.147602],
+        [0.004733, 0.691367, 0.3039],
+    ],
+    "all": np.eye(3).tolist(),
+}
+
+
+def linear(c: np.ndarray) -> np.ndarray:
+    return np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4)
+
+
+def companded(c: np.ndarray) -> np.ndarray:
+    c = np.clip(c, 0, 1)
+    return np.where(c <= 0.0031308, 12.92 * c, 1.055 * c ** (1 / 2.4) - 0.055)
+
+
+@pytest.mark.parametrize("eyes", sorted(SEEN_BY))
+def test_the_first_colours_differ_for_all_eyes(eyes):
+    base = np.array([rgb(k) for k in range(len(BASE))]) / 255
+    lab = rgb2lab(companded(linear(base) @ np.array(SEEN_BY[eyes]).T))
+    distance = np.linalg.norm(lab[:, None] - lab[None], axis=-1)
+    assert distance[~np.eye(len(base), dtype=bool)].min() > 20  # CIE76; 2.3 is just noticeable
+
+
+def test_the_first_colours_stand_out_from_both_grounds():
+    luminance = np.array(
+        [linear(np.array(rgb(k)) / 255) @ [0.2126, 0.7152, 0.0722] for k in range(len(BASE))]
+    )
+    assert (1.05 / (luminance + 0.05)).min() >= 1.9
+    assert ((luminance + 0.05) / 0.058).min() >= 1.9
+
+
+def test_fifty_colours_differ():
+    assert len({color(k) for k in range(50)}) == 50
+
+
+@pytest.mark.parametrize("number", range(50))
+def test_numbers_are_readable_on_their_colour(number):
+    luminance = float(linear(np.array(rgb(number)) / 255) @ [0.2126, 0.7152, 0.0722])
+    other = 0.0 if ink(number) == "#000" else 1.0
+    assert (max(luminance, other) + 0.05) / (min(luminance, other) + 0.05) >= 4.5
+
+
+def test_apply_pose_of_anchor_is_the_position():
+    o, shown = SCENE.objects[1], payload(SCENE, CONFIG)[0]["objects"][1]
+    anchor = o.points.mean(axis=0, keepdims=True)
+    there = [apply_pose(np.linalg.inv(s.T_ref_scan), anchor)[0] for s in o.observations]
+    shift = np.array([s["position"] for s in shown["observations"]]) - there
+    assert np.ptp(shift, axis=0).max() < 1e-9

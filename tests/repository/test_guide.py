@@ -1,0 +1,142 @@
+"""The pages of the guide: their Python runs, their commands parse, their links lead somewhere, the site builds."""
+
+from __future__ import annotations
+
+import functools
+import importlib
+import io
+import os
+import re
+import shlex
+import subprocess
+import sys
+from contextlib import redirect_stdout
+from pathlib import Path
+
+import jax
+import pytest
+import tyro
+from places import ROOT
+
+from more2_jax.cli.main import Command
+
+PAGES = sorted((ROOT / "docs").rglob("*.md"))
+BLOCK = re.compile(r"^```(\w*)\n(.*?)^```", re.DOTALL | re.MULTILINE)
+PROGRAM = re.compile(r"python -m ((?:train|eval)\.\w+)")
+RUN_ELSEWHERE = {"gradients.md"}  # tests/test_docs.py runs it, and looks at the gradient
+SHELL_WORDS = {"python3", "pip", "source", "export", ".venv/bin/pip"}
+
+
+def blocks(page: Path) -> list[tuple[str, str]]:
+    """Language and text of every fenced block, in order."""
+    return BLOCK.findall(page.read_text(encoding="utf-8"))
+
+
+def named(page: Path) -> str:
+    return str(page.relative_to(ROOT))
+
+
+def commands(page: Path) -> list[str]:
+    """The lines of a page's bash blocks, continued ones joined."""
+    text = "\n".join(body for language, body in blocks(page) if language == "bash")
+    return [line for line in text.replace("\\\n", " ").splitlines() if line.strip()]
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _compiled_once(tmp_path_factory):
+    """Pages share compiled programs within the session, or wherever all tests do."""
+    before = jax.config.values["jax_compilation_cache_dir"]
+    jax.config.update("jax_compilation_cache_dir", before or str(tmp_path_factory.mktemp("compiled")))
+    yield
+    jax.config.update("jax_compilation_cache_dir", before)
+
+
+WITH_PYTHON = [p for p in PAGES if p.name not in RUN_ELSEWHERE and "python" in dict(blocks(p))]
+
+
+@pytest.mark.parametrize("page", WITH_PYTHON, ids=named)
+def test_the_python_of_a_page_runs_and_prints_what_it_says(page, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, object] = {}
+    fenced, ran = blocks(page), 0
+    for k, (language, body) in enumerate(fenced):
+        if language != "python":
+            continue
+        printed = io.StringIO()
+        with redirect_stdout(printed):
+            exec(compile(body, f"{named(page)}, block {k}", "exec"), names)
+        ran += 1
+        if k + 1 < len(fenced) and fenced[k + 1][0] == "text":
+            assert printed.getvalue().strip() == fenced[k + 1][1].strip()
+    assert ran
+
+
+@pytest.mark.parametrize("page", [p for p in PAGES if commands(p)], ids=named)
+def test_the_commands_of_a_page_parse(page):
+    for line in commands(page):
+        words = shlex.split(line, comments=True)
+        if words[0] == "more2":
+            parse_more2(words[1:])
+        elif match := PROGRAM.search(line):
+            parse_program(match[1], words[3:])
+        else:
+            assert words[0] in SHELL_WORDS, line
+
+
+def parse_more2(argv: list[str]) -> None:
+    """What the command line makes of the words; exits where it refuses them."""
+    options = (tyro.conf.OmitArgPrefixes,)
+    assert tyro.cli(Command, args=argv, prog="more2", config=options) is not None  # type: ignore[arg-type]
+
+
+def parse_program(module: str, argv: list[str]) -> None:
+    """A program's arguments, through its own `main`, which is not run."""
+    main = importlib.import_module(module).main
+    called = []
+
+    @functools.wraps(main)
+    def recorded(*args, **kwargs):
+        called.append((args, kwargs))
+
+    tyro.cli(recorded, args=argv)
+    assert len(called) == 1
+
+
+@pytest.mark.parametrize(
+    ("parse", "words"),
+    [
+        (parse_more2, "run a.ply --out b --nonsense"),
+        (functools.partial(parse_program, "train.tools.census"), "--shard"),
+    ],
+)
+def test_a_flag_that_does_not_exist_is_noticed(parse, words, capsys):
+    with pytest.raises(SystemExit):
+        parse(words.split())
+
+
+@pytest.mark.parametrize(
+    "page", [p for p in PAGES if p.parent.name == "guide"] + [ROOT / "docs/index.md"], ids=named
+)
+def test_links_lead_somewhere(page):
+    for target in re.findall(r"\]\(([^)#]+?)(?:#[^)]*)?\)", page.read_text(encoding="utf-8")):
+        assert "://" in target or (page.parent / target).exists(), target
+
+
+def test_the_guide_is_in_the_navigation():
+    navigation = (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
+    guide = [p for p in PAGES if p.parent.name == "guide"]
+    missing = [p.name for p in guide if f" {p.relative_to(ROOT / 'docs')}\n" not in navigation]
+    assert missing == []
+
+
+def test_the_site_builds_strictly_and_loads_nothing_from_elsewhere(tmp_path):
+    pytest.importorskip("mkdocs", reason="needs the extra `docs`")
+    build = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", str(tmp_path)]
+    subprocess.run(build, cwd=ROOT, check=True, env=os.environ | {"NO_MKDOCS_2_WARNING": "1"}, timeout=120)
+    pages = list(tmp_path.rglob("*.html"))
+    assert len(pages) >= len(PAGES)
+    for page in pages:
+        html = page.read_text(encoding="utf-8")
+        loaded = re.findall(r"<(?:script|link|img|iframe)\b[^>]*?(?:src|href)=\"(https?:[^\"]+)\"", html)
+        assert loaded == [], page.name
+    assert "add_scan" in (tmp_path / "guide" / "api.html").read_text(encoding="utf-8")

@@ -1,0 +1,11 @@
+"""Parametric furniture."""
+
+from train.furniture.procedural.furniture import (
+    CATEGORIES,
+    Recipe,
+    procedural_mesh,
+    procedural_meshes,
+    procedural_recipes,
+)
+
+__all__ = ["CATEGORIES", "Recipe", "procedural_mesh", "procedural_meshes", "procedural_recipes"]

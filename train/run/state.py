@@ -1,0 +1,99 @@
+"""What a training run remembers from step to step, and how one step changes it."""
+
+from __future__ import annotations
+
+import dataclasses
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import optax
+from jax import Array
+from jax.sharding import Mesh
+
+from more2_jax.config import PriorConfig, TrainingConfig
+from more2_jax.network.prior import Prior
+from more2_jax.types import pytree
+from train.run.devices import by_rows
+from train.run.schedule import learning_rate
+from train.shards.losses import total_loss
+from train.shards.sampling import TrainingSample, sample_batch
+from train.shards.shards import Shapes
+
+
+@pytree
+class TrainingState:
+    """Everything that a checkpoint holds."""
+
+    params: dict[str, Any]
+    average: dict[str, Any]  # exponential moving average of the weights: what is shipped
+    optimiser: Any
+    step: Array
+
+
+def optimiser(config: TrainingConfig) -> optax.GradientTransformation:
+    """Adam with clipped gradients; a step whose gradient is not finite is left out."""
+    adam = optax.chain(optax.clip_by_global_norm(config.clip), optax.adam(learning_rate(config)))
+    return optax.apply_if_finite(adam, max_consecutive_errors=20)
+
+
+def initial_state(prior: Prior, config: TrainingConfig) -> TrainingState:
+    """The state at step 0."""
+    return TrainingState(
+        params=jax.tree.map(jnp.copy, prior.params),  # a step takes the old state's memory
+        average=jax.tree.map(jnp.copy, prior.params),
+        optimiser=optimiser(config).init(prior.params),
+        step=jnp.zeros((), jnp.int32),
+    )
+
+
+def draw(
+    shapes: Shapes, rows: Array, step: Array, model: PriorConfig, config: TrainingConfig, mesh: Mesh
+) -> tuple[TrainingSample, Array]:
+    """The batch of a step and the key of its dropout: functions of (seed, step) alone, whatever the devices.
+
+    `rows` lists the shapes to draw from; a shape that stands in it twice is drawn twice as often.
+    """
+    key = jax.random.fold_in(jax.random.key(config.seed), step)
+    index_key, sample_key, dropout_key = jax.random.split(key, 3)
+    index = rows[jax.random.randint(index_key, (config.batch,), 0, len(rows))]
+    sample = sample_batch(sample_key, shapes, index, config, model.encoder.points)
+    return jax.lax.with_sharding_constraint(sample, by_rows(mesh)), dropout_key
+
+
+@partial(jax.jit, static_argnames=("model", "config", "mesh"), donate_argnames="state")
+def training_step(
+    state: TrainingState,
+    shapes: Shapes,
+    rows: Array,
+    *,
+    model: PriorConfig,
+    config: TrainingConfig,
+    mesh: Mesh,
+) -> tuple[TrainingState, dict[str, Array]]:
+    """One Adam step; returns the new state and the loss terms.
+
+    The loss is that of the whole batch: JAX splits it over the rows of `mesh` and exchanges what rows share,
+    which is the codes of the contrast term and the gradient.
+    """
+    sample, dropout_key = draw(shapes, rows, state.step, model, config, mesh)
+
+    def loss(params: dict[str, Any]) -> tuple[Array, dict[str, Array]]:
+        prior = Prior(params=params, config=model)
+        return total_loss(prior, sample, config, dropout_key, mesh)
+
+    gradient, terms = jax.grad(loss, has_aux=True)(state.params)
+    updates, opt_state = optimiser(config).update(gradient, state.optimiser, state.params)
+    params = optax.apply_updates(state.params, updates)
+    # Early on the average follows quickly, or it would remember the random start for long.
+    keep = jnp.minimum(config.ema, (1 + state.step) / (10 + state.step))
+    average = jax.tree.map(lambda old, new: keep * old + (1 - keep) * new, state.average, params)
+    terms = terms | {"gradient": optax.global_norm(gradient)}
+    return dataclasses.replace(
+        state,
+        params=params,  # pyright: ignore[reportArgumentType]
+        average=average,
+        optimiser=opt_state,
+        step=state.step + 1,
+    ), terms

@@ -1,0 +1,133 @@
+"""Training losses (METHOD 2), for one shape seen twice or a batch of codes."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import optax
+from jax import Array
+from jax.sharding import Mesh
+from jaxtyping import Float
+
+from more2_jax.config import TrainingConfig
+from more2_jax.network.decoder import Decoder
+from more2_jax.network.prior import Prior, encode_ordered
+from more2_jax.network.row_map import in_turn
+from more2_jax.types import Embedding
+from train.shards.sampling import TrainingSample
+
+AT_ONCE = 1024  # points of clouds that a CPU encodes side by side
+LEAST_CORRELATION = 0.05  # of two F_eqv, whose norms are 1: below it their rotation is noise, and pulls less
+
+
+def sdf_loss(
+    predicted: Float[Array, "*b q"], truth: Float[Array, "*b q"], near_surface: float
+) -> Float[Array, ""]:
+    """Mean of λ|error|; λ = 1 where |truth| < `near_surface`, else 0.5. Canonical units."""
+    weight = jnp.where(jnp.abs(truth) < near_surface, 1.0, 0.5)
+    return jnp.mean(weight * jnp.abs(predicted - truth))
+
+
+def sign_loss(predicted: Float[Array, "*b q"], truth: Float[Array, "*b q"], width: float) -> Float[Array, ""]:
+    """Mean cross-entropy of inside or outside, the logit being −distance / `width`.
+
+    The error of a distance hardly tells the two sides of a thin board apart; this does.
+    """
+    return optax.sigmoid_binary_cross_entropy(-predicted / width, truth < 0).mean()
+
+
+def up_loss(eqv: Float[Array, "b 2 3 c"]) -> Float[Array, ""]:
+    """Mean squared distance between the mean direction of the first third of F_eqv and the shape's vertical.
+
+    Shapes are canonical, z up. Two of a rotation's three degrees of freedom then follow from semantics, which a
+    partial cloud keeps better than its moments.
+    """
+    c = eqv.shape[-1]
+    up = eqv[..., : c // 3].mean(axis=-1) * jnp.sqrt(1.0 * c)
+    return jnp.mean(jnp.sum((up - jnp.array([0.0, 0.0, 1.0])) ** 2, axis=-1))
+
+
+def contrast_loss(
+    first: Float[Array, "b c"], second: Float[Array, "b c"], temperature: float
+) -> Float[Array, ""]:
+    """InfoNCE both ways: row i of one view should be nearest in angle to row i of the other."""
+    a, b = (x / jnp.maximum(jnp.linalg.norm(x, axis=-1, keepdims=True), 1e-12) for x in (first, second))
+    logits = a @ b.T / temperature
+    labels = jnp.arange(len(a))
+    cross_entropy = optax.softmax_cross_entropy_with_integer_labels
+    return 0.5 * (cross_entropy(logits, labels).mean() + cross_entropy(logits.T, labels).mean())
+
+
+def turn_loss(eqv: Float[Array, "b 2 3 c"]) -> Float[Array, ""]:
+    """Mean of ‖F_eqv − F_eqv'‖²: both clouds have the shape's own orientation. 0 at best, 2 if unrelated."""
+    return jnp.mean(jnp.sum((eqv[:, 0] - eqv[:, 1]) ** 2, axis=(-2, -1)))
+
+
+def rotation_loss(eqv: Float[Array, "b 2 3 c"]) -> Float[Array, ""]:
+    """Mean of 1 − ⟨M, I⟩ / (‖M‖‖I‖), M = F_eqv F_eqv'ᵀ being what Kabsch's algorithm reads the rotation from.
+
+    `turn_loss` is lowered as well by vectors that all point along one axis, which says nothing of the turn about it:
+    here they score 0.42. 0 where M is a multiple of the identity, about 1 if the two are unrelated.
+    """
+    M = jnp.einsum("bic,bjc->bij", eqv[:, 0], eqv[:, 1])
+    length = jnp.sqrt(jnp.sum(M**2, axis=(-2, -1)) + LEAST_CORRELATION**2)
+    return 1.0 - jnp.mean(jnp.trace(M, axis1=-2, axis2=-1) / (jnp.sqrt(3.0) * length))
+
+
+def total_loss(
+    prior: Prior,
+    sample: TrainingSample,
+    config: TrainingConfig,
+    dropout_key: Array,
+    mesh: Mesh | None = None,
+) -> tuple[Float[Array, ""], dict[str, Float[Array, ""]]]:
+    """The training loss of a batch and its terms; shapes are canonical, so F_c → 0 and F_s → 1.
+
+    `mesh`: the devices that share the batch.
+    """
+    embedding, predicted = predict(prior, sample, dropout_key, train=True, mesh=mesh)
+    terms = {
+        "sdf": sdf_loss(predicted, sample.sdf, config.near_surface),
+        "center": jnp.mean(jnp.linalg.norm(embedding.center - sample.center + 1e-12, axis=-1)),
+        # Where the paper has |1 − F_s|: the same minimum and slope there, but a scale that shrinks towards 0,
+        # where |1 − F_s| has no pull left on the product of all layers, is pushed back.
+        "scale": jnp.mean(jnp.abs(jnp.log(embedding.scale))),
+        "contrast": contrast_loss(embedding.inv[:, 0], embedding.inv[:, 1], config.contrast_temperature),
+        "turn": turn_loss(embedding.eqv),
+        "rotation": rotation_loss(embedding.eqv),
+        "sign": sign_loss(predicted, sample.sdf, config.sign_width),
+        "up": up_loss(embedding.eqv),
+    }
+    weights = {
+        "sdf": 1.0,
+        "center": config.center_weight,
+        "scale": config.scale_weight,
+        "contrast": config.contrast_weight,
+        "turn": config.turn_weight,
+        "rotation": config.rotation_weight,
+        "sign": config.sign_weight,
+        "up": config.up_weight,
+    }
+    return sum((weights[k] * v for k, v in terms.items()), jnp.zeros(())), terms
+
+
+def predict(
+    prior: Prior, sample: TrainingSample, dropout_key: Array, train: bool, mesh: Mesh | None = None
+) -> tuple[Embedding, Float[Array, "b 2 q"]]:
+    """Encodes both clouds of every shape and decodes the queries with each cloud's own code."""
+    decoder = Decoder(prior.config)
+
+    def one(params: dict[str, Any], cloud: tuple[Array, Array, Array, Array]) -> tuple[Embedding, Array]:
+        points, mask, queries, key = cloud
+        e = encode_ordered(dataclasses.replace(prior, params=params), points, mask)
+        weights = {"params": params["decoder"]}
+        return e, decoder.apply(weights, e, queries, train, rngs={"dropout": key})  # type: ignore[return-value]
+
+    keys = jax.random.split(dropout_key, sample.sdf.shape[:2])
+    by_shape = (sample.points, sample.mask, sample.queries, keys)
+    clouds = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), by_shape)
+    found = in_turn(one, prior.params, clouds, max(1, AT_ONCE // sample.points.shape[2]), mesh)
+    return jax.tree.map(lambda x: x.reshape(-1, 2, *x.shape[1:]), found)

@@ -1,0 +1,119 @@
+"""Training samples as a pure function of (key, shapes): partial clouds with real scans' flaws, and queries.
+
+One shape at a time; vmap outside. Nothing here waits for the host, so that it also runs inside a training step.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Bool, Float, Int
+
+from more2_jax.config import TrainingConfig
+from more2_jax.geometry.points import farthest_points
+from more2_jax.types import pytree
+from train.shards.augmentation import (
+    Cloud,
+    Kept,
+    add_junk,
+    ball,
+    depth_noise,
+    half_space,
+    merge_views,
+    start_far_out,
+)
+from train.shards.shards import Shapes
+from train.shards.stretching import stretched
+
+LEAST_KEPT = 0.1  # of the points: a cloud of which cuts would leave less stays whole
+
+
+@pytree
+class TrainingSample:
+    """Two partial clouds of one shape, in farthest-point order, and points of known signed distance."""
+
+    points: Float[Array, "*b 2 n 3"]  # canonical units
+    mask: Bool[Array, "*b 2 n"]
+    queries: Float[Array, "*b 2 q 3"]
+    sdf: Float[Array, "*b 2 q"]
+    center: Float[Array, "*b 2 3"]  # of the shape, in its cloud's frame: what F_c should be
+
+
+def sample_batch(
+    key: Array, shapes: Shapes, index: Int[Array, " b"], config: TrainingConfig, points: int
+) -> TrainingSample:
+    """Samples shapes `index`; sample i depends on (key, i, index[i], index[i − 1]) alone.
+
+    `points` is the encoder's input size. Fragments that lie beside shape i are of shape i − 1 of the batch.
+    """
+    return sample_rows(
+        row_keys(key, jnp.arange(len(index))), shapes, index, jnp.roll(index, 1), config, points
+    )
+
+
+def row_keys(key: Array, rows: Int[Array, " b"]) -> Array:
+    """The keys of rows of a batch."""
+    return jax.vmap(lambda row: jax.random.fold_in(key, row))(rows)
+
+
+def sample_rows(
+    keys: Array,
+    shapes: Shapes,
+    index: Int[Array, " b"],
+    other: Int[Array, " b"],
+    config: TrainingConfig,
+    points: int,
+) -> TrainingSample:
+    """One sample a key: of shape `index`, beside fragments of shape `other`."""
+
+    def one(key: Array, i: Array, j: Array) -> TrainingSample:
+        pair = jax.random.split(key)
+        return jax.vmap(lambda k: _half_sample(k, shapes, i, shapes.views[j], config, points))(pair)
+
+    return jax.vmap(one)(keys, index, other)
+
+
+def _half_sample(
+    key: Array, shapes: Shapes, index: Int[Array, ""], other: Array, config: TrainingConfig, count: int
+) -> TrainingSample:
+    cloud_key, query_key, stretch_key, jitter_key = jax.random.split(key, 4)
+    points, mask = partial_cloud(cloud_key, shapes.views[index], other, config, count)
+    queries, sdf = _queries(query_key, shapes, index, config.queries)
+    if config.stretch > 0:
+        surface = shapes.views[index].reshape(-1, 3)
+        points, queries, sdf = stretched(stretch_key, points, queries, sdf, surface, config.stretch)
+    # The encoder centres its cloud itself: a shift of everything shifts F_c as much and changes nothing else. What
+    # makes F_c learnt is that queries stay canonical while partiality moves the mean of the cloud.
+    center = config.center_jitter * jax.random.normal(jitter_key, (3,))
+    return TrainingSample(points=points + center, mask=mask, queries=queries + center, sdf=sdf, center=center)
+
+
+def _queries(
+    key: Array, shapes: Shapes, index: Int[Array, ""], count: int
+) -> tuple[Float[Array, "q 3"], Float[Array, " q"]]:
+    uniform_key, near_key = jax.random.split(key)
+    half = (count // 2,)
+    uniform = jax.random.randint(uniform_key, half, 0, shapes.sdf_uniform.shape[1])
+    near = jax.random.randint(near_key, half, 0, shapes.sdf_near.shape[1])
+    both = jnp.concatenate([shapes.sdf_uniform[index, uniform], shapes.sdf_near[index, near]])
+    return both[:, :3].astype(jnp.float32), both[:, 3].astype(jnp.float32)
+
+
+def partial_cloud(
+    key: Array, views: Float[Array, "v n 3"], other: Array, config: TrainingConfig, count: int
+) -> tuple[Cloud, Kept]:
+    """A few views merged, noise, then cuts and junk; `count` points in farthest-point order."""
+    keys = jax.random.split(key, 7)
+    open_to_flaws = jax.random.bernoulli(keys[0], config.augment_probability)
+    points, view = merge_views(
+        keys[1], views, config.max_views, config.raw_points, open_to_flaws * config.one_view_probability
+    )
+    points, lost = depth_noise(keys[2], points, view, config, open_to_flaws * config.depth_noise_probability)
+    points = points + config.noise * jax.random.normal(keys[3], points.shape)
+    kept = ~lost & ~half_space(keys[4], points, open_to_flaws * config.crop_probability)
+    kept &= ~ball(keys[5], points, open_to_flaws * config.ball_probability)
+    # A shelf seen edge-on fits into a ball. What is left of it has no size, and the logarithm of its scale no slope.
+    kept = jnp.where(kept.sum() < LEAST_KEPT * len(points), True, kept)
+    points, kept = add_junk(keys[6], points, kept, other, open_to_flaws * config.junk_probability)
+    return farthest_points(*start_far_out(points, kept), count)
