@@ -30,7 +30,7 @@ def main(
     """Registers the second scan's objects onto the first's, by every variant.
 
     Args:
-        data: rooms of train.synthesise.
+        data: rooms of train.synthesize.
         scenes: how many, from the first; 0 for all.
         prior: name of shipped weights, or a file.
         batch: pairs a compiled call takes.

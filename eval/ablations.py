@@ -1,8 +1,8 @@
-"""Which parts matter: embeddings of the matching, variables of the joint optimisation, the descent of registration.
+"""Which parts matter: embeddings of the matching, variables of the joint optimization, the descent of registration.
 
 `python -m eval.ablations --data data/flying_sparse --out runs/ablations --scenes 4`
 
-Joint optimisation starts from the method's own poses of every scan onto the first, for true matches.
+Joint optimization starts from the method's own poses of every scan onto the first, for true matches.
 """
 
 from __future__ import annotations
@@ -84,7 +84,7 @@ class Settings(Options):
     """Which data, which settings, and where results go."""
 
     scans: int = 5
-    """Scans that the joint optimisation sees."""
+    """Scans that the joint optimization sees."""
     samples: int = 20_000
     """Points on each surface."""
 

@@ -60,7 +60,7 @@ def main(data: tuple[Path, ...], prior: str = "small", visits: int = 2, scenes: 
     """Fits the log odds of pairs of scans (first and every later one) and says how well they hold.
 
     Args:
-        data: folders of train.synthesise, all upright or none.
+        data: folders of train.synthesize, all upright or none.
         prior: name of shipped weights, or a file.
         visits: scans of a room that take part, from the first; 0 for all.
         scenes: rooms of a folder, from the first; 0 for all.

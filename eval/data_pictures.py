@@ -93,23 +93,23 @@ def camera(pixels: int) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, "r 3
 
 
 def seen_points(shards: Sequence[Path], solid: SourceMesh, pixels: int = 260) -> Float[np.ndarray, "h w 3"]:
-    """The points of three of the 24 depth views, a colour each."""
+    """The points of three of the 24 depth views, a color each."""
     view = open_shards(list(shards), "train")
     row = next((k for k, m in enumerate(view.meta) if m["name"] == solid.name), 0)
     points = view[row]["views"].astype(np.float64)
     nearest = np.argsort(-(view_directions() @ (EYE / np.linalg.norm(EYE))))[[0, 2, 4]]
     image = np.ones((pixels, pixels, 3))
-    colours = np.array([[0.85, 0.37, 0.01], [0.11, 0.62, 0.47], [0.46, 0.44, 0.70]])
+    colors = np.array([[0.85, 0.37, 0.01], [0.11, 0.62, 0.47], [0.46, 0.44, 0.70]])
     forward = -EYE / np.linalg.norm(EYE)
     right = np.cross(forward, [0, 0, 1.0]) / np.linalg.norm(np.cross(forward, [0, 0, 1.0]))
     up = np.cross(right, forward)
-    for k, colour in zip(nearest, colours, strict=True):
+    for k, color in zip(nearest, colors, strict=True):
         offset = points[k] - EYE
         depth = offset @ forward
         column = ((offset @ right) / depth / 0.33 + 1) / 2 * (pixels - 1)
         line = (1 - (offset @ up) / depth / 0.33) / 2 * (pixels - 1)
         inside = (column >= 0) & (column < pixels - 1) & (line >= 0) & (line < pixels - 1)
-        image[line[inside].astype(int), column[inside].astype(int)] = colour
+        image[line[inside].astype(int), column[inside].astype(int)] = color
     return image
 
 
@@ -127,8 +127,8 @@ def slices(solid: SourceMesh, pixels: int = 180) -> list[Float[np.ndarray, "h w 
         )
         signed = np.where(is_inside(solid.vertices, solid.faces, query), -distance, distance)
         share = np.clip(np.abs(signed) / 0.3, 0, 1)[:, None]
-        colour = np.where(signed[:, None] < 0, [[0.1, 0.3, 0.8]], [[0.8, 0.25, 0.1]])
-        picture = 1 - (0.25 + 0.75 * share) * (1 - colour)
+        color = np.where(signed[:, None] < 0, [[0.1, 0.3, 0.8]], [[0.8, 0.25, 0.1]])
+        picture = 1 - (0.25 + 0.75 * share) * (1 - color)
         bands = (np.abs((signed / 0.05) % 1) < 0.06)[:, None]
         picture = np.where(bands, picture * 0.85, picture)
         pictures.append(np.where(distance[:, None] < 0.004, 0.1, picture).reshape(pixels, pixels, 3))

@@ -24,7 +24,7 @@ from rich.progress import track
 from eval.harness.results import circumstances_now
 from eval.harness.runs import weights_digest, write_json
 from eval.harness.tables import latex, markdown, on_screen
-from eval.peers.learned_decoders import VARIANTS, decoder_of, decoder_step, drawn, optimiser, start
+from eval.peers.learned_decoders import VARIANTS, decoder_of, decoder_step, drawn, optimizer, start
 from eval.prior_scores import BATCH, SEEN, see_twice
 from eval.scores.figures import Figure, Record, rows_of
 from more2_jax.config import TrainingConfig, TrainingRun, load_config
@@ -99,7 +99,7 @@ def trained(
         prior, jnp.zeros((prior.config.encoder.points, 3)), jnp.ones(prior.config.encoder.points, bool)
     )
     weights = start(prior, codes, seed)
-    states: dict[str, Any] = {name: optimiser(steps, rate).init(w) for name, w in weights.items()}
+    states: dict[str, Any] = {name: optimizer(steps, rate).init(w) for name, w in weights.items()}
     here, size = jnp.asarray(rows), prior.config.encoder.points
     for number in track(range(steps), description="training"):
         sample, _ = drawn(shapes, here, jnp.asarray(number), config=training, points=size)

@@ -104,7 +104,7 @@ def changes(scan: int, objects: list[SceneObject]) -> Changes:
 
 
 def observation(scan: int, instance: int, shift: float) -> Observation:
-    """Seen `shift` metres along x from where the reference scan saw it."""
+    """Seen `shift` meters along x from where the reference scan saw it."""
     T = np.eye(4)
     T[0, 3] = shift
     return Observation(scan=scan, instance=instance, T_ref_scan=T, score=0.9, rms_m=0.01, converged=True)

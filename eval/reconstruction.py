@@ -77,7 +77,7 @@ FIGURES = [
 
 
 def main(options: Annotated[Settings, tyro.conf.arg(name="")]) -> None:
-    """Meshes of the method with and without joint optimisation, and of what one would use instead."""
+    """Meshes of the method with and without joint optimization, and of what one would use instead."""
     peers = SURFACERS if options.peers else {}
     stated = {"methods": [*own_names(options.preset, preset(options.preset)), *peers], "scans": options.scans}
     current = start_run("reconstruction", options, {**stated, "samples": options.samples})
@@ -87,16 +87,16 @@ def main(options: Annotated[Settings, tyro.conf.arg(name="")]) -> None:
 
 
 def own_names(preset: str, config: SceneConfig) -> tuple[str, str]:
-    """The preset's, and the same with or without the joint optimisation, whichever the preset is not.
+    """The preset's, and the same with or without the joint optimization, whichever the preset is not.
 
-    Of a single observation, the optimisation is that of its code.
+    Of a single observation, the optimization is that of its code.
     """
-    without = "without optimisation" if config.joint.steps else "with joint optimisation"
+    without = "without optimization" if config.joint.steps else "with joint optimization"
     return f"ours, {preset}", f"ours, {preset}, {without}"
 
 
 def with_joint(config: SceneConfig) -> SceneConfig:
-    """The settings with joint optimisation, where the preset has none."""
+    """The settings with joint optimization, where the preset has none."""
     joint = dataclasses.replace(config.joint, steps=config.joint.steps or JOINT_STEPS)
     return dataclasses.replace(config, joint=joint)
 
@@ -144,7 +144,7 @@ def work(
     peers: Mapping[str, Surfacer],
     o: Settings,
 ) -> list[list[Record]]:
-    """All objects of some scenes: encoded, and optimised, together; then one mesh after the other."""
+    """All objects of some scenes: encoded, and optimized, together; then one mesh after the other."""
     seen = seen_objects(scenes, o.scans)
     plain, encoding_s = timed(lambda: embedded(prior, seen, o.batch), len(seen))
     fitted, fitting_s = timed(lambda: fitted_in_batches(prior, plain, with_joint(config), o.batch), len(seen))
@@ -194,7 +194,7 @@ def mesh_seen(prior: Prior, s: Seen, o: SceneObject, config: SceneConfig) -> Mes
 def fitted_in_batches(
     prior: Prior, objects: Sequence[SceneObject], config: SceneConfig, batch: int
 ) -> list[SceneObject]:
-    """Joint optimisation of every object, `batch` a call."""
+    """Joint optimization of every object, `batch` a call."""
     found: list[SceneObject] = []
     for start in range(0, len(objects), batch):
         part = objects[start : start + batch]

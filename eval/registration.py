@@ -101,7 +101,7 @@ def figures(right_deg: float) -> list[Figure]:
 
 
 def main(options: Annotated[Settings, tyro.conf.arg(name="")]) -> None:
-    """Registration of true pairs by the method, without its optimisation, and by what one would use instead."""
+    """Registration of true pairs by the method, without its optimization, and by what one would use instead."""
     data = benchmark(options)
     upright = is_upright(options, data)
     ours = own_settings(options.preset, upright)
@@ -129,7 +129,7 @@ def own_settings(name: str, upright: bool) -> dict[str, RegistrationConfig]:
     return {
         f"ours, {name}": config,
         **({f"ours, {name}, sensors unknown": blind} if config.free_weight else {}),
-        f"ours, {name}, without optimisation": dataclasses.replace(
+        f"ours, {name}, without optimization": dataclasses.replace(
             blind, steps=0, surface_steps=0, polish_steps=0
         ),
         KABSCH: dataclasses.replace(paper, steps=0, icp_steps=0),

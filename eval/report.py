@@ -37,7 +37,7 @@ Written by `python -m eval.report`; [how to make and read them](evaluation.md). 
 scenes; "of" is the denominator; a failure counts in it. Bold is best of its line, whoever made it.
 
 - *paper's formula*: as printed. *as published*: as the published code computes it. *strict*: rotations over the
-  object's own measured symmetry group, copies interchangeable once each, distances in centimetres.
+  object's own measured symmetry group, copies interchangeable once each, distances in centimeters.
 - A line without one of these names is the same in all columns that differ elsewhere, or has no other form.
 - What the paper prints is quoted below our tables. Its data, weights and some of its definitions are others: **the two
   may not be compared**.

@@ -14,7 +14,7 @@ from more2_jax.scans.demo import demo_scan_paths
 
 rng = np.random.default_rng(0)
 scan = m2.read_scan(demo_scan_paths()[0])
-chair = next(i for i in scan.instances if i.id == 5).points  # metres, (n, 3)
+chair = next(i for i in scan.instances if i.id == 5).points  # meters, (n, 3)
 
 # The chair is scanned twice: different points, 2 mm of noise, and a turn by 70° and a shift in between.
 order = rng.permutation(len(chair))

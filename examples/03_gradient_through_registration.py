@@ -21,7 +21,7 @@ config = RegistrationConfig(points=64, sdf_points=64, steps=5, icp_steps=2)
 
 
 def loss(source, target):
-    """What registration minimises, at the pose it ends with."""
+    """What registration minimizes, at the pose it ends with."""
     mask = jnp.ones(len(source), bool)
     pair = Pair(
         source=sample(source, mask, config.points, dense=False),

@@ -17,9 +17,9 @@ from more2_jax.scans.demo import demo_ground_truth, demo_scan_paths
 
 truth = demo_ground_truth()
 chair = truth.at(0, 5)
-surface = apply_pose(chair.T_scan_model, truth.surfaces[chair.model])  # true points of all sides, metres
+surface = apply_pose(chair.T_scan_model, truth.surfaces[chair.model])  # true points of all sides, meters
 seen = next(i for i in m2.read_scan(demo_scan_paths()[0]).instances if i.id == chair.instance).points
-view = seen[seen[:, 0] > np.median(seen[:, 0])]  # only the half towards +x
+view = seen[seen[:, 0] > np.median(seen[:, 0])]  # only the half toward +x
 
 prior = m2.load_prior("small")
 code = jax.tree.map(lambda x: np.asarray(x)[0], m2.encode(prior, m2.pad_clouds([view])))

@@ -20,7 +20,7 @@ class EncoderConfig:
 
     widths: tuple[int, ...] = (32, 32, 64, 64, 128, 256, 512)
     code: int = 256
-    neighbours: int = 16
+    neighbors: int = 16
     linear_blocks: int = 2  # the first blocks have no attention
     head_channels: int = 16
     downsample_blocks: tuple[int, ...] = (2, 4, 5)  # 0-based: thinned on entering these
@@ -64,7 +64,7 @@ class MatchingConfig:
     assignment: Literal["hungarian", "greedy"] = "hungarian"
     size_weight: float = 0.0  # how much of a mismatch in metric size is held against a pair
     max_size_ratio: float = 0.0  # 0: any
-    motion_weight: float = 0.0  # a metre moved costs this much score: decides among identical objects
+    motion_weight: float = 0.0  # a meter moved costs this much score: decides among identical objects
     # Beyond the paper: surfaces decide, pairs less likely one object than two are none, the score is in log odds.
     verify: bool = False
     candidates: int = 8  # partners of every object, and of every instance, that are tried
@@ -111,7 +111,7 @@ class RegistrationConfig:
 
 @dataclass(frozen=True)
 class JointConfig:
-    """Joint optimisation (METHOD 6); the defaults are the paper's."""
+    """Joint optimization (METHOD 6); the defaults are the paper's."""
 
     points: int = 1024
     start: Literal["best", "accumulated"] = (
@@ -202,10 +202,10 @@ class TrainingConfig:
     crop_probability: float = 0.5  # a half-space cut off, as by a truncated mask
     ball_probability: float = 0.5  # a ball removed, as by occlusion
     junk_probability: float = 0.5  # a fragment of another object, or a patch of floor or wall, added
-    depth_noise_probability: float = 0.4  # the camera's: along the ray, quantised, with lost edges
+    depth_noise_probability: float = 0.4  # the camera's: along the ray, quantized, with lost edges
     depth_noise: float = 0.002  # standard deviation of inverse depth, 1 / canonical unit
     depth_step: float = 0.002  # of inverse depth
-    center_jitter: float = 0.0  # standard deviation of a shift of cloud, queries and centre; published 0.05
+    center_jitter: float = 0.0  # standard deviation of a shift of cloud, queries and center; published 0.05
     stretch: float = 0.0  # axes are scaled by up to this share, at random
     near_surface: float = 0.1  # |SDF| below it weighs 1, else 0.5
     center_weight: float = 0.2
@@ -278,10 +278,19 @@ def preset(name: str, *, upright: bool = False) -> SceneConfig:
     raise ValueError(f"preset {name!r}; needed 'paper' or 'robust'")
 
 
+# Keys of older weight files and settings.
+RENAMED = {
+    "neighbours": "neighbors",
+    "normal_neighbours": "normal_neighbors",
+    "core_neighbours": "core_neighbors",
+}
+
+
 def from_dict(cls: type[C], values: dict[str, Any], where: str = "") -> C:
     """Builds dataclass `cls` from plain values; raises ValueError on keys it does not have or wrong types."""
     if not isinstance(values, dict):
         raise ValueError(f"{where or 'settings'}: got {values!r}, needed a mapping")
+    values = {RENAMED.get(key, key): value for key, value in values.items()}
     hints = typing.get_type_hints(cls)
     names = {f.name for f in dataclasses.fields(cls)}  # type: ignore[arg-type]
     if unknown := sorted(set(values) - names):

@@ -1,4 +1,4 @@
-"""Metrics of the paper (METHOD 9), in NumPy on the host; metres and degrees."""
+"""Metrics of the paper (METHOD 9), in NumPy on the host; meters and degrees."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def as_published_rotation_error_deg(R: Matrix3, R_true: Matrix3) -> float:
 
 
 def translation_error(t: Float[np.ndarray, "3"], t_true: Float[np.ndarray, "3"]) -> float:
-    """Distance between two translations, metres."""
+    """Distance between two translations, meters."""
     return float(np.linalg.norm(np.asarray(t) - t_true))
 
 
@@ -67,7 +67,7 @@ def scene_recall(recalls: Errors, share: float) -> float:
 
 
 def transformation_rmse(T: Pose, T_true: Pose, source: Points, target: Points) -> float:
-    """Root mean square distance between where two poses put points, over both directions, metres."""
+    """Root mean square distance between where two poses put points, over both directions, meters."""
     there = apply_pose(T, source) - apply_pose(T_true, source)
     back = apply_pose(np.linalg.inv(T), target) - apply_pose(np.linalg.inv(T_true), target)
     return float(np.sqrt(np.mean(np.sum(np.concatenate([there, back]) ** 2, axis=1))))
@@ -79,7 +79,7 @@ def as_published_rmse(T: Pose, T_true: Pose, source: Points, target: Points) -> 
 
 
 def modified_chamfer(T: Pose, T_true: Pose, source: Points, target: Points) -> float:
-    """Mean squared nearest distance of the moved source to the whole target and back, square metres.
+    """Mean squared nearest distance of the moved source to the whole target and back, square meters.
 
     Whole: each cloud together with the other under the true pose, so that missing parts do not count.
     """
@@ -91,17 +91,17 @@ def modified_chamfer(T: Pose, T_true: Pose, source: Points, target: Points) -> f
 
 
 def accuracy(predicted: Points, truth: Points) -> float:
-    """Mean distance of predicted surface points from the true surface, metres."""
+    """Mean distance of predicted surface points from the true surface, meters."""
     return float(KDTree(truth).query(predicted)[0].mean())
 
 
 def completeness(predicted: Points, truth: Points) -> float:
-    """Mean distance of true surface points from the predicted surface, metres."""
+    """Mean distance of true surface points from the predicted surface, meters."""
     return accuracy(truth, predicted)
 
 
 def chamfer_l1(predicted: Points, truth: Points) -> float:
-    """(accuracy + completeness) / 2, metres."""
+    """(accuracy + completeness) / 2, meters."""
     return (accuracy(predicted, truth) + completeness(predicted, truth)) / 2
 
 

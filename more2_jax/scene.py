@@ -98,10 +98,10 @@ def add_scan(
 def reconstruct(
     prior: Prior, scene: LivingScene, config: SceneConfig, *, progress: Watcher | None = None
 ) -> LivingScene:
-    """Poses of objects seen more than once are made to agree, or optimised with the code; then meshes are extracted.
+    """Poses of objects seen more than once are made to agree, or optimized with the code; then meshes are extracted.
 
     `closing.steps` (`robust`): all observations of an object are laid onto one another at once. `joint.steps`
-    (`paper`): code and poses of all objects are optimised in one call. Observations in doubt
+    (`paper`): code and poses of all objects are optimized in one call. Observations in doubt
     (`Observation.accumulated` False) have no part in it. Objects that have a mesh have not changed since and are left
     alone.
     """

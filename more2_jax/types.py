@@ -31,20 +31,20 @@ def pytree(cls: type[T]) -> type[T]:
 class PointCloud:
     """A padded point cloud; rows where `mask` is False carry no meaning.
 
-    `points` are metres relative to `origin`, which stays float64 on the host: an object surveyed a
-    kilometre from the world's zero keeps its micrometres in float32.
+    `points` are meters relative to `origin`, which stays float64 on the host: an object surveyed a
+    kilometer from the world's zero keeps its micrometers in float32.
     """
 
-    points: Float[Array, "*batch n 3"]  # metres, relative to `origin`
+    points: Float[Array, "*batch n 3"]  # meters, relative to `origin`
     mask: Bool[Array, "*batch n"]  # True where the point is real
-    origin: Float[Array | np.ndarray, "*batch 3"]  # metres, in the scan's frame
+    origin: Float[Array | np.ndarray, "*batch 3"]  # meters, in the scan's frame
 
 
 @pytree
 class Anchors:
     """Points of the observed surface with the encoder's features there: what a local decoder looks up."""
 
-    offset: Float[Array, "*batch a 3"]  # metres, relative to the embedding's `center`
+    offset: Float[Array, "*batch a 3"]  # meters, relative to the embedding's `center`
     features: Float[Array, "*batch a 3 f"]  # unit norm over (3, f); columns turn with the object
     mask: Bool[Array, "*batch a"]  # True where the anchor is real
 
@@ -53,11 +53,11 @@ class Anchors:
 class Sight:
     """What sensors at known places saw around one object: depth images that say how far space is free (`sight.py`)."""
 
-    eye: Float[Array | np.ndarray, "*batch v 3"]  # where each stood, in the object's frame, metres
+    eye: Float[Array | np.ndarray, "*batch v 3"]  # where each stood, in the object's frame, meters
     turn: Float[Array | np.ndarray, "*batch v 3 3"]  # rows: across, down its image, and forward
     half: Float[Array | np.ndarray, "*batch v"]  # tangent of half the angle that the image spans
     side: Float[Array | np.ndarray, "*batch v"]  # pixels of a row, the first ones of `clear`
-    clear: Float[Array | np.ndarray, "*batch v p p"]  # metres that are free along a pixel's ray; 0: not known
+    clear: Float[Array | np.ndarray, "*batch v p p"]  # meters that are free along a pixel's ray; 0: not known
 
 
 @pytree
@@ -66,9 +66,9 @@ class Embedding:
 
     inv: Float[Array, "*batch c"]  # F_inv, no unit
     eqv: Float[Array, "*batch 3 c"]  # F_eqv, columns turn with the object
-    scale: Float[Array, "*batch"]  # F_s, metres per canonical unit
-    center: Float[Array, "*batch 3"]  # F_c, metres, relative to `origin`
-    origin: Float[Array | np.ndarray, "*batch 3"]  # metres, in the scan's frame
+    scale: Float[Array, "*batch"]  # F_s, meters per canonical unit
+    center: Float[Array, "*batch 3"]  # F_c, meters, relative to `origin`
+    origin: Float[Array | np.ndarray, "*batch 3"]  # meters, in the scan's frame
     anchors: tuple[Anchors, ...] = ()  # a level each; none where the decoder reads the four codes alone
 
 
@@ -85,7 +85,7 @@ class Registration:
     """A pose per pair, with its own loss (paper §3.3)."""
 
     T_target_source: jaxlie.SE3  # source's local frame to target's local frame
-    loss: Float[Array, "*batch"]  # what was minimised, at this very pose
+    loss: Float[Array, "*batch"]  # what was minimized, at this very pose
     rms_m: Float[Array, "*batch"]  # trimmed root mean square of nearest distances, both ways
     converged: Bool[Array, "*batch"]  # the pose stopped moving and explains both clouds
     # The rest only where `RegistrationConfig.refine` is "surface".
@@ -99,7 +99,7 @@ class Registration:
 
 @pytree
 class JointFit:
-    """Shape code and poses of one object, optimised together over its observations (paper §3.5)."""
+    """Shape code and poses of one object, optimized together over its observations (paper §3.5)."""
 
     embedding: Embedding  # in the frame of the reference observation
     T_ref_obs: jaxlie.SE3  # one a observation
@@ -111,7 +111,7 @@ class JointFit:
 
 @dataclass(frozen=True, kw_only=True)
 class Mesh:
-    """A triangle mesh; metres."""
+    """A triangle mesh; meters."""
 
     vertices: Float[np.ndarray, "v 3"]
     faces: Int[np.ndarray, "f 3"]
@@ -119,7 +119,7 @@ class Mesh:
 
 @dataclass(frozen=True, kw_only=True)
 class Color:
-    """The mean colour of points in CIE L*a*b* (D65), and of how many."""
+    """The mean color of points in CIE L*a*b* (D65), and of how many."""
 
     points: int
     lab: Float[np.ndarray, "3"]
@@ -127,7 +127,7 @@ class Color:
 
 @dataclass(frozen=True, kw_only=True)
 class Instance:
-    """One object as one scan saw it; metres, in the scan's frame, float64."""
+    """One object as one scan saw it; meters, in the scan's frame, float64."""
 
     id: int
     points: Float[np.ndarray, "n 3"]
@@ -153,7 +153,7 @@ class Scan:
     instances: tuple[Instance, ...]
     background: Float[np.ndarray, "b 3"] = field(default_factory=lambda: np.zeros((0, 3)))
     sensors: Float[np.ndarray, "s 3"] = (
-        field(  # where its sensors stood, in its frame, metres; none: not known
+        field(  # where its sensors stood, in its frame, meters; none: not known
             default_factory=lambda: np.zeros((0, 3))
         )
     )
@@ -205,7 +205,7 @@ class SceneObject:
     point_scan: Int[np.ndarray, "n"]
     embedding: Embedding  # NumPy leaves, unbatched; frame of the reference observation
     mesh: Mesh | None = None
-    color: Color | None = None  # of the accumulated observations whose scans have colours
+    color: Color | None = None  # of the accumulated observations whose scans have colors
     sight: Sight | None = (
         None  # what sensors saw around it, in its frame; made when a scan is added, never kept
     )
@@ -234,7 +234,7 @@ class ScanRecord:
     instances: tuple[int, ...]
     skipped: tuple[Skipped, ...] = ()
     frame: Frame = field(default_factory=Frame, compare=False)
-    background: Float[np.ndarray, "b 3"] = field(  # thinned, to look at; metres, in the scan's frame, float64
+    background: Float[np.ndarray, "b 3"] = field(  # thinned, to look at; meters, in the scan's frame, float64
         default_factory=lambda: np.zeros((0, 3)), compare=False, repr=False
     )
     sensors: Float[np.ndarray, "s 3"] = field(  # where they stood, in the scan's frame, float64

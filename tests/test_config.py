@@ -48,7 +48,7 @@ def test_paper_is_the_paper():
 def test_base_has_the_published_widths():
     model, published = load_config(ROOT / "configs" / "base.yaml", TrainingRun).model, PriorConfig()
     for part, names in {
-        "encoder": ("widths", "code", "neighbours", "linear_blocks", "head_channels", "downsample_blocks"),
+        "encoder": ("widths", "code", "neighbors", "linear_blocks", "head_channels", "downsample_blocks"),
         "decoder": ("hidden", "layers", "skip_layer"),
     }.items():
         for name in names:
@@ -69,9 +69,9 @@ def test_unknown_preset_names_the_known():
     ("values", "complaint"),
     [
         ({"encoder": {"width": 3}}, r"encoder: unknown width; known are .*widths"),
-        ({"encoder": {"neighbours": "many"}}, "encoder.neighbours: got 'many', needed int"),
-        ({"encoder": {"neighbours": 1.5}}, "encoder.neighbours: got 1.5, needed int"),
-        ({"encoder": {"neighbours": True}}, "encoder.neighbours: got True, needed int"),
+        ({"encoder": {"neighbors": "many"}}, "encoder.neighbors: got 'many', needed int"),
+        ({"encoder": {"neighbors": 1.5}}, "encoder.neighbors: got 1.5, needed int"),
+        ({"encoder": {"neighbors": True}}, "encoder.neighbors: got True, needed int"),
         ({"encoder": {"widths": 16}}, "encoder.widths: got 16, needed a list"),
         ({"encoder": {"widths": [16, "x"]}}, r"encoder.widths\[1\]: got 'x', needed int"),
         ({"encoder": [1]}, r"encoder: got \[1\], needed a mapping"),

@@ -39,8 +39,8 @@ def main(
 
     Args:
         out: folder of the shards and of report.json (what was left out, and why).
-        source: packed .npz collections, SweetHome3D catalogues (.sh3f), ShapeNet's folder, .csv tables with a
-            column path (and category, split, licence), or folders of OBJ, GLB, OFF, PLY or STL files.
+        source: packed .npz collections, SweetHome3D catalogs (.sh3f), ShapeNet's folder, .csv tables with a
+            column path (and category, split, license), or folders of OBJ, GLB, OFF, PLY or STL files.
         held_out: sources of the test split, which is never trained on.
         procedural: parametric furniture, so many pieces in all.
         most_per_source: of one collection, so that none outweighs the others.

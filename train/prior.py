@@ -75,7 +75,7 @@ def main(
         out: checkpoints, log.jsonl, curves, pictures, weights.npz (the last) and best.npz. Shared by all hosts.
         minutes: wall-clock budget.
         name: of the weights; by default the configuration file's.
-        warm_start: weights to begin with in a fresh `--out`: name of shipped ones, or a file; the optimiser starts
+        warm_start: weights to begin with in a fresh `--out`: name of shipped ones, or a file; the optimizer starts
             anew. The configuration's `model` has to be theirs.
         coordinator: host:port of process 0, on a run of several processes.
         processes: how many there are.
@@ -105,7 +105,7 @@ def prepared(
     name: str,
     warm: Prior | None = None,
 ) -> Setting:
-    """Loads the shapes, initialises the weights if none are given, spreads both over the devices."""
+    """Loads the shapes, initializes the weights if none are given, spreads both over the devices."""
     training = settings.training
     mesh = device_mesh(training.batch)
     train, rows = load_mix(shards, "train")

@@ -1,4 +1,4 @@
-"""FlyingShape, as `train.synthesise` writes it (open models) and in the published layout (npz files)."""
+"""FlyingShape, as `train.synthesize` writes it (open models) and in the published layout (npz files)."""
 
 from __future__ import annotations
 
@@ -34,12 +34,12 @@ def flyingshape(folder: Path) -> Benchmark:
             right_deg=RIGHT_DEG,
         )
     raise ValueError(
-        f"{folder}: neither scene_*/scene.json (train.synthesise) nor scenes of npz files (published); needed one"
+        f"{folder}: neither scene_*/scene.json (train.synthesize) nor scenes of npz files (published); needed one"
     )
 
 
 def open_flyingshape(folder: Path) -> Benchmark:
-    """Scenes of train.synthesise."""
+    """Scenes of train.synthesize."""
     files = {p.parent.name: p.parent for p in sorted(folder.glob("scene_*/scene.json"))}
     files = {name: path for name, path in files.items() if path.suffix != ".partial"}
     first = read_json(next(iter(files.values())) / "scene.json")

@@ -29,7 +29,7 @@ class KnownObject:
     mesh: Mesh | None = None  # closed, model frame; None where the data set has none
     forgiven_deg: tuple[float, ...] = (90.0, 180.0)  # by the published evaluation
     moved: dict[int, bool] = field(default_factory=dict)  # since the first scan; absent: not known
-    canonical: float = 1.0  # canonical units a metre
+    canonical: float = 1.0  # canonical units a meter
 
     @property
     def first(self) -> int:

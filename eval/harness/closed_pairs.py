@@ -15,7 +15,7 @@ from more2_jax.scene import record
 from more2_jax.tracking.objects import new_object, seen_again
 from more2_jax.types import Embedding, Instance, Observation, Scan, ScanRecord, SceneObject
 
-Cloud = np.ndarray  # (n, 3), metres, in its scan's frame
+Cloud = np.ndarray  # (n, 3), meters, in its scan's frame
 
 
 def closed_poses(

@@ -24,7 +24,7 @@ class Options:
     out: Path
     """Folder of the results; a stopped run resumes there."""
     dataset: Literal["flyingshape", "3rscan"] = "flyingshape"
-    """flyingshape: written by train.synthesise, or the published npz files."""
+    """flyingshape: written by train.synthesize, or the published npz files."""
     preset: Literal["paper", "robust"] = "robust"
     """Settings of the method."""
     prior: str = "small"

@@ -42,14 +42,14 @@ PAPER: dict[str, dict[str, Quoted]] = {
         "FlyingShape": {
             "RR [%]": {
                 "paper's own": "83.83",
-                "without optimisation": "83.00",
+                "without optimization": "83.00",
                 "RPMNet": "23.17",
                 "FreeReg": "47.50",
                 "GeoTransformer": "77.67",
             },
-            "MedRE [°]": {"paper's own": "0.74", "without optimisation": "0.86"},
-            "RMSE": {"paper's own": "18.47", "without optimisation": "20.83"},
-            "MedCD": {"paper's own": "0.0168", "without optimisation": "0.0171"},
+            "MedRE [°]": {"paper's own": "0.74", "without optimization": "0.86"},
+            "RMSE": {"paper's own": "18.47", "without optimization": "20.83"},
+            "MedCD": {"paper's own": "0.0168", "without optimization": "0.0171"},
         },
         "3RScan": {
             "RR [%]": {
@@ -65,9 +65,9 @@ PAPER: dict[str, dict[str, Quoted]] = {
     },
     "reconstruction": {
         "FlyingShape": {
-            "Chamfer-L1 [10⁻³]": {"paper's own": "6.11", "without optimisation": "6.27", "ConvONet": "6.64"},
-            "IoU [%]": {"paper's own": "66.73", "without optimisation": "49.98", "ConvONet": "36.99"},
-            "SDF recall [%]": {"paper's own": "83.33", "without optimisation": "78.00", "ConvONet": "80.67"},
+            "Chamfer-L1 [10⁻³]": {"paper's own": "6.11", "without optimization": "6.27", "ConvONet": "6.64"},
+            "IoU [%]": {"paper's own": "66.73", "without optimization": "49.98", "ConvONet": "36.99"},
+            "SDF recall [%]": {"paper's own": "83.33", "without optimization": "78.00", "ConvONet": "80.67"},
         },
         "3RScan": {
             "Chamfer-L1, one way [10⁻³]": {"paper's own": "6.16"},

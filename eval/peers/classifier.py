@@ -52,7 +52,7 @@ def main(config: Path, shards: tuple[Path, ...], out: Path, steps: int = 600) ->
     prior = started_cold(settings, shapes, "classifier")
     head = jnp.zeros((prior.config.encoder.code, len(names)))
     params: dict[str, Any] = {"encoder": prior.params["encoder"], "head": head}
-    state: Any = optimiser(training).init(params)
+    state: Any = optimizer(training).init(params)
     here, of_row = jnp.asarray(rows), jnp.asarray(labels)
     for number in track(range(steps), description=f"{len(names)} categories"):
         sample, index = drawn(
@@ -74,7 +74,7 @@ def categories(sources: Sequence[Path]) -> tuple[list[str], Int[np.ndarray, " sh
     return names, np.array([names.index(c) for c in given])
 
 
-def optimiser(config: TrainingConfig) -> optax.GradientTransformation:
+def optimizer(config: TrainingConfig) -> optax.GradientTransformation:
     """Adam with clipped gradients."""
     return optax.chain(optax.clip_by_global_norm(config.clip), optax.adam(learning_rate(config)))
 
@@ -100,7 +100,7 @@ def step(
         return optax.softmax_cross_entropy_with_integer_labels(logits, label).mean(), right
 
     (value, right), gradient = jax.value_and_grad(loss, has_aux=True)(params)
-    update, state = optimiser(config).update(gradient, state, params)
+    update, state = optimizer(config).update(gradient, state, params)
     return optax.apply_updates(params, update), state, {"loss": value, "right": right}  # pyright: ignore[reportReturnType]
 
 

@@ -17,7 +17,7 @@ NORMAL_RADIUS, FEATURE_RADIUS = 2.5 * VOXEL, 5 * VOXEL
 
 @dataclass(frozen=True, kw_only=True)
 class Featured:
-    """A thinned cloud with normals, and a feature a point; centred, in units of `diagonal`."""
+    """A thinned cloud with normals, and a feature a point; centerd, in units of `diagonal`."""
 
     cloud: Any  # open3d.geometry.PointCloud
     feature: Any  # open3d.pipelines.registration.Feature
@@ -35,7 +35,7 @@ def open3d_cloud(points: Points) -> Any:
 
 
 def featured(points: Points, center: Float[np.ndarray, "3"], unit: float) -> Featured:
-    """FPFH of every thinned point; normals point away from the centre, as no camera is known."""
+    """FPFH of every thinned point; normals point away from the center, as no camera is known."""
     o3d = library("open3d")
     cloud = open3d_cloud((points - center) / unit).voxel_down_sample(VOXEL)
     cloud.estimate_normals(o3d.geometry.KDTreeSearchParamHybrid(NORMAL_RADIUS, 30))

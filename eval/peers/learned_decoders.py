@@ -33,7 +33,7 @@ class Variant:
     """One decoder of the study."""
 
     query: Literal["inner", "inv"]  # ⟨F_eqv, q⟩, or q in a frame that F_eqv spans
-    network: Literal["deepsdf", "mlp"]  # weight normalisation and a skip, or neither
+    network: Literal["deepsdf", "mlp"]  # weight normalization and a skip, or neither
     learns: Literal["distance", "occupancy"] = "distance"
 
 
@@ -110,7 +110,7 @@ def start(prior: Prior, codes: Embedding, seed: int) -> dict[str, Any]:
     }
 
 
-def optimiser(steps: int, learning_rate: float) -> optax.GradientTransformation:
+def optimizer(steps: int, learning_rate: float) -> optax.GradientTransformation:
     """The same for all."""
     return optax.chain(
         optax.clip_by_global_norm(1.0), optax.adam(optax.cosine_decay_schedule(learning_rate, steps))
@@ -151,7 +151,7 @@ def decoder_step(
     for name, variant in VARIANTS.items():
         grad = jax.value_and_grad(partial(batch_loss, prior, variant, codes, sample, config))
         losses[name], gradient = grad(weights[name])
-        update, states[name] = optimiser(steps, learning_rate).update(gradient, states[name], weights[name])
+        update, states[name] = optimizer(steps, learning_rate).update(gradient, states[name], weights[name])
         weights[name] = optax.apply_updates(weights[name], update)
     return weights, states, losses
 

@@ -24,13 +24,13 @@ PAIRS, BINS, LONGEST_M = 20_000, 64, 4.0  # of D2
 
 def sorted_extents(cloud: Points) -> Float[np.ndarray, "3"]:
     """Logarithm of the sorted extents along the principal axes: metric size alone."""
-    centred = cloud - cloud.mean(axis=0)
-    axes = np.linalg.svd(centred[:: max(1, len(centred) // 2000)], full_matrices=False)[2]
-    return np.log(np.maximum(np.sort(np.ptp(centred @ axes.T, axis=0)), 1e-3))
+    centerd = cloud - cloud.mean(axis=0)
+    axes = np.linalg.svd(centerd[:: max(1, len(centerd) // 2000)], full_matrices=False)[2]
+    return np.log(np.maximum(np.sort(np.ptp(centerd @ axes.T, axis=0)), 1e-3))
 
 
 def d2(cloud: Points) -> Float[np.ndarray, "bins"]:
-    """Histogram of distances between random points, metres (Osada's D2)."""
+    """Histogram of distances between random points, meters (Osada's D2)."""
     rng = np.random.default_rng(0)
     a, b = cloud[rng.integers(0, len(cloud), (2, PAIRS))]
     counts = np.histogram(np.linalg.norm(a - b, axis=1), BINS, (0, LONGEST_M))[0]

@@ -1,6 +1,6 @@
 """What one would make a surface of an object's points with instead: Poisson, ball pivoting, alpha shapes (Open3D).
 
-Each takes accumulated points (metres) and returns a mesh in their frame, or None where it finds no triangle. None of
+Each takes accumulated points (meters) and returns a mesh in their frame, or None where it finds no triangle. None of
 them closes what was not seen.
 """
 
@@ -28,7 +28,7 @@ DEPTH = 7  # of Poisson's octree: cells of 0.8 % of the cube's edge
 
 
 def prepared(points: Points) -> tuple[Any, float, Float[np.ndarray, "3"]]:
-    """The thinned cloud of unit diagonal with outward normals, its scale and its centre."""
+    """The thinned cloud of unit diagonal with outward normals, its scale and its center."""
     o3d = library("open3d")
     unit, center = diagonal(points), points.mean(axis=0)
     cloud = open3d_cloud((points - center) / unit).voxel_down_sample(VOXEL)
@@ -51,7 +51,7 @@ def poisson(points: Points) -> Mesh | None:
         return None
     far = KDTree(np.asarray(cloud.points)).query(np.asarray(mesh.vertices))[0] > CROP
     mesh.remove_vertices_by_mask(far)
-    return in_metres(mesh, unit, center)
+    return in_meters(mesh, unit, center)
 
 
 def ball_pivoting(points: Points) -> Mesh | None:
@@ -60,7 +60,7 @@ def ball_pivoting(points: Points) -> Mesh | None:
     cloud, unit, center = prepared(points)
     spacing = float(np.mean(cloud.compute_nearest_neighbor_distance()))
     radii = o3d.utility.DoubleVector([r * spacing for r in RADII])
-    return in_metres(
+    return in_meters(
         o3d.geometry.TriangleMesh.create_from_point_cloud_ball_pivoting(cloud, radii), unit, center
     )
 
@@ -68,14 +68,14 @@ def ball_pivoting(points: Points) -> Mesh | None:
 def alpha_shape(points: Points) -> Mesh | None:
     """The alpha shape at 3 % of the diagonal."""
     cloud, unit, center = prepared(points)
-    return in_metres(
+    return in_meters(
         library("open3d").geometry.TriangleMesh.create_from_point_cloud_alpha_shape(cloud, ALPHA),
         unit,
         center,
     )
 
 
-def in_metres(mesh: Any, unit: float, center: Float[np.ndarray, "3"]) -> Mesh | None:
+def in_meters(mesh: Any, unit: float, center: Float[np.ndarray, "3"]) -> Mesh | None:
     """The mesh back in the points' frame; None without a triangle."""
     faces = np.asarray(mesh.triangles)
     if not len(faces):

@@ -1,7 +1,7 @@
 """What one would register two clouds of an object with instead: global features, or many starts of GICP.
 
-Each takes source and target (metres, each in its scan's frame) and whether objects only turn about the vertical, and
-returns `T_target_source`, or None where it fails. All work on clouds centred on their means, in units of the
+Each takes source and target (meters, each in its scan's frame) and whether objects only turn about the vertical, and
+returns `T_target_source`, or None where it fails. All work on clouds centerd on their means, in units of the
 target's diagonal: features and thresholds then fit a stool and a wardrobe.
 """
 
@@ -89,7 +89,7 @@ def many_starts(source: Points, target: Points, upright: bool) -> Pose | None:
 
 
 def starts(upright: bool, free: int = 60) -> list[Pose]:
-    """Rotations about the centre, as poses: 24 turns, or the group of the icosahedron (60) or cube (24)."""
+    """Rotations about the center, as poses: 24 turns, or the group of the icosahedron (60) or cube (24)."""
     turns = np.linspace(0, 2 * np.pi, YAW_STARTS, endpoint=False)[:, None]
     group = Rotation.create_group("I" if free == 60 else "O")
     rotations = (Rotation.from_euler("z", turns) if upright else group).as_matrix()
@@ -99,7 +99,7 @@ def starts(upright: bool, free: int = 60) -> list[Pose]:
 
 
 def refined(source: Points, target: Points, poses: Sequence[Pose]) -> Pose | None:
-    """GICP from poses between the centred, scaled clouds; the one that fits best, back in metres."""
+    """GICP from poses between the centerd, scaled clouds; the one that fits best, back in meters."""
     found = best_fit(source, target, poses)
     return None if found is None else found[0]
 

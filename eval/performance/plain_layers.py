@@ -19,7 +19,7 @@ Outputs = tuple[Array, Array, Array, Array]  # F_inv, F_eqv, F_s, F_c
 TINY = 1e-30
 
 
-def normalised(x: Float[Array, "*b 3 c"]) -> Float[Array, "*b 3 c"]:
+def normalized(x: Float[Array, "*b 3 c"]) -> Float[Array, "*b 3 c"]:
     """Squared lengths of all channels sum to 1."""
     return x / jnp.sqrt(jnp.sum(x * x, axis=(-2, -1), keepdims=True) + TINY)
 
@@ -55,11 +55,11 @@ def attention(
     w: Mapping[str, Any], query: Float[Array, "n 3 i"], graph: Float[Array, "n k 3 j"], c: EncoderConfig
 ) -> Float[Array, "n 3 o"]:
     """Attention over all edges, then the global context."""
-    q = normalised(vnla(w["query"], query, c.leak))
-    k = normalised(vnla(w["key"], graph, c.leak))
+    q = normalized(vnla(w["query"], query, c.leak))
+    k = normalized(vnla(w["key"], graph, c.leak))
     v = vnla(w["value"], graph, c.leak)
-    n, neighbours, _, width = v.shape
-    by_head = (q[:, None] * k).reshape(n, neighbours, 3, -1, c.head_channels).sum(axis=(2, 4))
+    n, neighbors, _, width = v.shape
+    by_head = (q[:, None] * k).reshape(n, neighbors, 3, -1, c.head_channels).sum(axis=(2, 4))
     share = jax.nn.softmax(by_head / jnp.sqrt(3.0 * c.head_channels), axis=1)
     mixed = jnp.sum(jnp.repeat(share, c.head_channels, axis=-1)[:, :, None] * v, axis=1)
     context = jnp.broadcast_to(mixed.mean(axis=0), (n, 3, width))
@@ -73,16 +73,16 @@ def encode(w: Mapping[str, Any], points: Float[Array, "n 3"], c: EncoderConfig) 
     thinning = dict(zip(c.downsample_blocks, c.downsample_factors, strict=True))
     for i in range(len(c.widths)):
         query = features[: len(features) // thinning.get(i, 1)]
-        graph, block = edges(query, features, c.neighbours, first=i == 0), w[f"block_{i}"]
+        graph, block = edges(query, features, c.neighbors, first=i == 0), w[f"block_{i}"]
         if i < c.linear_blocks:
             features = vnla(block["value"], graph, c.leak).mean(axis=1)
         else:
             features = attention(block, query, graph, c)
     x = vnla(w["head"], features, c.leak).mean(axis=0)
-    eqv, center = normalised(x), w["center"]
+    eqv, center = normalized(x), w["center"]
     q = vnla(center["inner"], x, c.leak) @ center["residual"] + x @ center["shortcut"]
     offset = relu(q, q @ center["direction"], c.leak)[..., 0]
-    inv = jnp.sum(normalised(x @ w["invariant"]) * eqv, axis=-2)
+    inv = jnp.sum(normalized(x @ w["invariant"]) * eqv, axis=-2)
     scale = jnp.sqrt(jnp.sum(x * x, axis=-2) + TINY).mean() * c.output_scale
     return inv, eqv, scale, mean + offset * c.output_scale
 

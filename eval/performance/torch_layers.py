@@ -17,7 +17,7 @@ from torch.nn.functional import linear  # pyright: ignore[reportMissingImports]
 LEAK = 0.2
 
 
-def normalised(x: Tensor) -> Tensor:
+def normalized(x: Tensor) -> Tensor:
     """Squared lengths of all channels sum to 1; x is (…, 3, channels)."""
     length = x.norm(dim=-2, keepdim=True)
     return x / length.clamp_min(1e-12) * (length / length.norm(dim=-1, keepdim=True).clamp_min(1e-12))
@@ -31,7 +31,7 @@ def relu(q: Tensor, k: Tensor) -> Tensor:
 
 
 class VNLA(nn.Module):
-    """VN-Linear, then VN-LeakyReLU along a learnt direction."""
+    """VN-Linear, then VN-LeakyReLU along a learned direction."""
 
     def __init__(self, inputs: int, outputs: int, directions: int | None = None) -> None:
         super().__init__()
@@ -48,7 +48,7 @@ class Block(nn.Module):
 
     def __init__(self, before: int, width: int, index: int, settings: dict) -> None:
         super().__init__()
-        self.k, self.head = settings["neighbours"], settings["head_channels"]
+        self.k, self.head = settings["neighbors"], settings["head_channels"]
         self.first, self.attends = index == 0, index >= settings["linear_blocks"]
         self.value = VNLA(3 if self.first else 2 * before, width)
         if self.attends:
@@ -72,7 +72,7 @@ class Block(nn.Module):
         value = self.value(graph)
         if not self.attends:
             return value.mean(dim=2)
-        product = normalised(self.query(query))[:, :, None] * normalised(self.key(graph))
+        product = normalized(self.query(query))[:, :, None] * normalized(self.key(graph))
         by_head = product.unflatten(-1, (-1, self.head)).sum(dim=(-3, -1)) / (3 * self.head) ** 0.5
         share = by_head.softmax(dim=2).repeat_interleave(self.head, dim=-1)
         mixed = (share[..., None, :] * value).sum(dim=2)
@@ -100,14 +100,14 @@ class Encoder(nn.Module):
         for i, block in enumerate(self.blocks):
             features = block(features[:, : features.shape[1] // self.thinning.get(i, 1)], features)
         x = self.head(features).mean(dim=1)
-        eqv = normalised(x)
+        eqv = normalized(x)
         q = self.residual(self.inner(x)) + self.shortcut(x)
         center = mean + relu(q, self.direction(q))[..., 0]
-        return (normalised(self.invariant(x)) * eqv).sum(dim=-2), eqv, x.norm(dim=-2).mean(dim=-1), center
+        return (normalized(self.invariant(x)) * eqv).sum(dim=-2), eqv, x.norm(dim=-2).mean(dim=-1), center
 
 
 class Decoder(nn.Module):
-    """Ψ: the code of an object beside every query, weight normalisation, one skip."""
+    """Ψ: the code of an object beside every query, weight normalization, one skip."""
 
     def __init__(self, code: int, hidden: int, layers: int, skip: int, narrow: bool) -> None:
         super().__init__()

@@ -1,7 +1,7 @@
 """Scores of one mesh against the true one (METHOD 9), in three columns.
 
 `paper`: the printed formulas, canonical units (longest edge 0.9). `published`: as the published code computes them:
-its Chamfer-L1 is squared and against vertices, its IoU the share of true vertices inside. `strict`: metres, true
+its Chamfer-L1 is squared and against vertices, its IoU the share of true vertices inside. `strict`: meters, true
 IoU, and distances from samples of one surface to the other surface itself. Between samples of both even equal
 surfaces are apart by half the spacing: 0.5 cm of furniture at 20,000 samples.
 """

@@ -1,7 +1,7 @@
 """Scores of one pose (METHOD 9), in three columns.
 
 `paper`: the printed formula. `published`: as the published code computes it. `strict`: over the object's own
-symmetry group, in metres. A failure has None for every score.
+symmetry group, in meters. A failure has None for every score.
 """
 
 from __future__ import annotations
@@ -92,7 +92,7 @@ def published_chamfer(T: Pose, T_true: Pose, source: Points, target: Points) -> 
 
 
 def chamfer_distance(T: Pose, T_true: Pose, source: Points, target: Points) -> float:
-    """The paper's modified chamfer as a distance: not squared, and the mean of both ways, metres."""
+    """The paper's modified chamfer as a distance: not squared, and the mean of both ways, meters."""
     whole_target = np.concatenate([target, apply_pose(T_true, source)])
     whole_source = np.concatenate([source, apply_pose(np.linalg.inv(T_true), target)])
     there = KDTree(whole_target).query(apply_pose(T, source))[0]

@@ -66,7 +66,7 @@ def score_object(o: SceneObject, truth: DemoTruth) -> DemoScore:
 def pose_error(
     reference: TrueInstance, other: TrueInstance, seen: Observation, truth: DemoTruth
 ) -> tuple[float, float]:
-    """Rotation error (degrees, up to the model's symmetry) and error in placing its centre (metres)."""
+    """Rotation error (degrees, up to the model's symmetry) and error in placing its center (meters)."""
     T_true = reference.T_scan_model @ np.linalg.inv(other.T_scan_model)
     # In the reference scan's frame the symmetry axis is the model's vertical, turned along.
     rotation_deg = symmetry_aware_rotation_error_deg(
@@ -81,7 +81,7 @@ def pose_error(
 
 
 def mesh_error(o: SceneObject, mine: TrueInstance, truth: DemoTruth) -> float:
-    """Chamfer-L1 of the mesh against the true outer surface, metres."""
+    """Chamfer-L1 of the mesh against the true outer surface, meters."""
     if o.mesh is None:
         return float("nan")
     mesh = trimesh.Trimesh(o.mesh.vertices, o.mesh.faces, process=False)

@@ -34,7 +34,7 @@ DOING = {
     "match": "matching",
     "register": "registering",
     "close": "fitting together",
-    "joint": "optimising jointly",
+    "joint": "optimizing jointly",
     "mesh": "meshing",
 }
 

@@ -25,7 +25,7 @@ def export_scene(scene: LivingScene, target: str | Path, format: str, *, scan: i
     """Writes the scene as one file and returns its path.
 
     `target` is a file, or a folder, in which the file is called `export` and the format's suffix. Lengths are
-    metres. Every object's mesh lies in the frame of its reference observation, so `inverse(T_ref_scan)` puts it
+    meters. Every object's mesh lies in the frame of its reference observation, so `inverse(T_ref_scan)` puts it
     where a scan saw it. `scan` counts from 0, or from the last with −1.
 
     - glb: a node an object with its mesh (points where it has none), an animation over all scans of one second

@@ -30,14 +30,14 @@ def placed(scene: LivingScene, scan: int) -> list[tuple[int, SceneObject, Float[
 
 @dataclass(frozen=True, kw_only=True)
 class Track:
-    """An object as a node that moves: geometry about its own centre, and a pose for every scan.
+    """An object as a node that moves: geometry about its own center, and a pose for every scan.
 
-    Files hold geometry in single precision; about its own centre it keeps its micrometres however far from
+    Files hold geometry in single precision; about its own center it keeps its micrometers however far from
     the world's zero it lies. Poses are in the scene's frame, which its scans may not share. Where the object
     is absent its pose is the last one seen, or the first.
     """
 
-    vertices: Float[np.ndarray, "v 3"]  # metres, relative to the node
+    vertices: Float[np.ndarray, "v 3"]  # meters, relative to the node
     T_scene_node: Float[np.ndarray, "scans 4 4"]
     present: Bool[np.ndarray, " scans"]
 
@@ -59,7 +59,7 @@ def track(o: SceneObject, scans: int) -> Track:
 
 
 def quaternions(poses: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, "n 4"]:
-    """Rotations as x, y, z, w; neighbours are on one side, so that going from one to the next is the short way."""
+    """Rotations as x, y, z, w; neighbors are on one side, so that going from one to the next is the short way."""
     result = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
     for before, after in itertools.pairwise(result):
         after *= -1.0 if before @ after < 0 else 1.0

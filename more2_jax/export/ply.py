@@ -14,7 +14,7 @@ from more2_jax.types import LivingScene
 
 
 def write_ply(scene: LivingScene, path: Path, scan: int) -> None:
-    """Points in the frame of `scan`, metres, z up; the vertex property `object` is the object's number."""
+    """Points in the frame of `scan`, meters, z up; the vertex property `object` is the object's number."""
     there = placed(scene, scan)
     clouds = [apply_pose(T_scan_ref, accumulated_points(o)) for _, o, T_scan_ref in there]
     points, numbers = np.concatenate(clouds), np.repeat([k for k, _, _ in there], [len(c) for c in clouds])

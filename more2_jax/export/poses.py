@@ -10,7 +10,7 @@ from more2_jax.types import LivingScene
 
 
 def write_poses(scene: LivingScene, path: Path, scan: int) -> None:
-    """What scene.json holds, less colours and names of files beside it; `scan` chooses nothing: all are written."""
+    """What scene.json holds, less colors and names of files beside it; `scan` chooses nothing: all are written."""
     content = scene_to_json(scene)
     left_out = ("mesh", "points", "color")
     objects = [{k: v for k, v in o.items() if k not in left_out} for o in content.pop("objects")]

@@ -18,7 +18,7 @@ SUFFIXES = (".usda", ".usdc", ".usd")  # by which USD chooses text or binary
 
 
 def write_usd(scene: LivingScene, path: Path, scan: int) -> None:
-    """All scans at time codes 0, 1, …, one a second; metres, z up. `scan` chooses nothing."""
+    """All scans at time codes 0, 1, …, one a second; meters, z up. `scan` chooses nothing."""
     if path.suffix not in SUFFIXES:
         raise ValueError(f"{path}: suffix {path.suffix!r}; needed one of {', '.join(SUFFIXES)}")
     pxr = _pxr()

@@ -16,10 +16,10 @@ FLOOR_SHARE = 0.3  # of the fullest layer: the lowest that holds as much is the 
 
 
 def floor_height(background: Points) -> float | None:
-    """Height of the lowest layer that holds a good part of the fullest one's points, metres; None without points."""
+    """Height of the lowest layer that holds a good part of the fullest one's points, meters; None without points."""
     if not len(background):
         return None
-    # A stray point a kilometre off must not make a million layers.
+    # A stray point a kilometer off must not make a million layers.
     least, most = np.quantile(background[:, 2], STRAY)
     z = background[(background[:, 2] >= least) & (background[:, 2] <= most), 2]
     count, edges = np.histogram(z, bins=max(1, int(np.ceil(np.ptp(z) / LAYER_M))))

@@ -1,7 +1,7 @@
 """Free space: what sensors at known places looked through holds nothing of an object.
 
 Beyond the paper. A view is a coarse depth image about one object, made of all points of its scan (the object's, its
-neighbours', the room's): along a ray the space is free up to the nearest point in that pixel or beside it, less a
+neighbors', the room's): along a ray the space is free up to the nearest point in that pixel or beside it, less a
 margin that grows as a depth camera's noise does. A pixel without points says nothing. No image of the sensor is
 needed, only where it stood; so a surface that no sensor caught, as it was seen too steeply or not sampled, may be
 looked through by mistake, and free space has a say, not the last word.
@@ -27,13 +27,13 @@ VIEWS = 8  # of an object: places that lie farthest apart, as it sees them
 PIXELS = 96  # at most, a side of a view
 FEWEST_PIXELS = 16
 WIDE = 1.2  # half the width of a view, in that of the object as seen
-COARSE = 2.5  # pixels are so many times the median angle between neighbouring points of the object
+COARSE = 2.5  # pixels are so many times the median angle between neighboring points of the object
 NEAREST_M = 0.05  # of what lies nearer to a sensor, it sees nothing
 MARGIN_M, MARGIN_PER_M2 = 0.02, 0.005  # kept from a seen point, and more with the square of its distance
 
 
 def sight_of(cloud: Points, room: Points, sensors: Points) -> Sight | None:
-    """What sensors (positions) saw around a cloud, `room` being all points of the scan; all in its frame, metres.
+    """What sensors (positions) saw around a cloud, `room` being all points of the scan; all in its frame, meters.
 
     `VIEWS` sensors at most are asked. None where none of them stands clear of the cloud.
     """
@@ -80,7 +80,7 @@ def view_of(cloud: Points, room: Points, eye: Float[np.ndarray, "3"]) -> Sight |
 
 
 def margin(depth: Float[np.ndarray, "*_"]) -> Float[np.ndarray, "*_"]:
-    """How far in front of a seen point space is not yet taken as free, metres."""
+    """How far in front of a seen point space is not yet taken as free, meters."""
     return MARGIN_M + MARGIN_PER_M2 * depth**2
 
 

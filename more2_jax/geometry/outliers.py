@@ -1,7 +1,7 @@
-"""Points that lie apart from their neighbourhood: flying pixels and depth noise, not a piece's surface.
+"""Points that lie apart from their neighborhood: flying pixels and depth noise, not a piece's surface.
 
-Local outlier factor (Breunig et al., 2000) in its simplest form: how far a point's neighbours are, against how far
-those of its neighbours are. Sparse sampling alone makes no outlier, since it is sparse around it as well.
+Local outlier factor (Breunig et al., 2000) in its simplest form: how far a point's neighbors are, against how far
+those of its neighbors are. Sparse sampling alone makes no outlier, since it is sparse around it as well.
 """
 
 from __future__ import annotations
@@ -10,19 +10,19 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.spatial import KDTree
 
-NEIGHBOURS = 12
+NEIGHBORS = 12
 
 Points = Float[np.ndarray, "n 3"]
 
 
 def outlier_factors(points: Points) -> Float[np.ndarray, " n"]:
-    """Mean distance of every point's neighbours over the mean of theirs; near 1 within a surface, 1 of doubled points.
+    """Mean distance of every point's neighbors over the mean of theirs; near 1 within a surface, 1 of doubled points.
 
     All 1 where there are too few points to tell.
     """
-    if len(points) <= NEIGHBOURS:
+    if len(points) <= NEIGHBORS:
         return np.ones(len(points))
-    distance, near = KDTree(points).query(points, k=NEIGHBOURS + 1)
+    distance, near = KDTree(points).query(points, k=NEIGHBORS + 1)
     own = np.asarray(distance)[:, 1:].mean(axis=1)
     around = own[np.asarray(near)[:, 1:]].mean(axis=1)
     return np.divide(own, around, out=np.ones(len(points)), where=around > 0)

@@ -1,6 +1,6 @@
 """Registration on surfaces: normals of a cloud, and robust point-to-plane alignment both ways; one pair, vmapped.
 
-Generalised ICP (Segal et al., 2009) with both covariances flat: what lies off the common tangent plane counts in
+Generalized ICP (Segal et al., 2009) with both covariances flat: what lies off the common tangent plane counts in
 full, what slides along it hardly. A Geman-McClure weight, sharpened step by step, takes the place of a maximal
 distance: what one scan did not see pulls ever less.
 """
@@ -25,7 +25,7 @@ DAMPING = 1e-4  # of the normal equations, in shares of their trace: a ball may 
 NO_TILT = (1.0, 1.0, 1.0, 0.0, 0.0, 1.0)  # shift, and turn about the vertical
 WRITTEN_OUT = 6  # rows of a system: of a pose; what is larger would compile for longer than it runs
 ONE_AXIS = 1e-6  # of matrices of trace 1: what distinguishes eigenvalues by less is rounding
-NEIGHBOURHOOD = 2.5  # half width of a normal's neighbourhood, in median distances between neighbours
+NEIGHBORHOOD = 2.5  # half width of a normal's neighborhood, in median distances between neighbors
 
 
 @pytree
@@ -79,10 +79,10 @@ def normal_estimator(
     cloud: Float[Array, "m 3"], mask: Bool[Array, " m"]
 ) -> Callable[[Float[Array, "n 3"]], Float[Array, "n 3"]]:
     """Normals at any points: the direction of least spread of the cloud around them, weighted by a Gaussian."""
-    width = NEIGHBOURHOOD * spacing(cloud, mask)
+    width = NEIGHBORHOOD * spacing(cloud, mask)
 
     def normals(points: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
-        # All moments about the cloud's own zero, by one matrix product; the cloud is centred, so none cancels badly.
+        # All moments about the cloud's own zero, by one matrix product; the cloud is centerd, so none cancels badly.
         squared = sum((points[:, None, i] - cloud[None, :, i]) ** 2 for i in range(3))
         weight = jnp.where(mask, jnp.exp(-0.5 * squared / width**2), 0.0)
         weight = weight / jnp.maximum(weight.sum(axis=1, keepdims=True), 1e-30)
@@ -145,7 +145,7 @@ def solve_spd(matrix: Float[Array, "n n"], right: Float[Array, "n m"]) -> Float[
 
 
 def spacing(points: Float[Array, "n 3"], mask: Bool[Array, " n"]) -> Float[Array, ""]:
-    """Median distance of a cloud's points to their nearest neighbours; 1e-6 where all are one point."""
+    """Median distance of a cloud's points to their nearest neighbors; 1e-6 where all are one point."""
     some = points[::8]
     squared = sum((some[:, None, i] - points[None, :, i]) ** 2 for i in range(3))
     other = mask & (jnp.arange(len(points)) != 8 * jnp.arange(len(some))[:, None]) & (squared > 0)
@@ -205,7 +205,7 @@ class NormalEquations:
 def normal_equations(
     T: jaxlie.SE3, source: Surface, target: Surface, reach: Float[Array, ""]
 ) -> NormalEquations:
-    """Linearised at `T`; a correspondence as far apart as `reach` counts a quarter, one of crossed surfaces not."""
+    """Linearized at `T`; a correspondence as far apart as `reach` counts a quarter, one of crossed surfaces not."""
     c = correspondences(T, source, target)
     # Components first: sums over many points are then products of matrices with long rows, which are fast.
     points, gap = c.source.T, c.target.T - c.source.T

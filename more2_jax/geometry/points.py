@@ -1,4 +1,4 @@
-"""Farthest points, nearest neighbours, Kabsch, chamfer: for one cloud or one pair; vmap outside."""
+"""Farthest points, nearest neighbors, Kabsch, chamfer: for one cloud or one pair; vmap outside."""
 
 from __future__ import annotations
 
@@ -115,7 +115,7 @@ def trimmed(squared: Float[Array, " n"], share: float) -> Bool[Array, " n"]:
 
 
 def two_way_rms(a: Sampled, b: Sampled, share: float) -> Float[Array, ""]:
-    """Trimmed root mean square nearest distance, metres: of a's sample to b and of b's to a, then their mean.
+    """Trimmed root mean square nearest distance, meters: of a's sample to b and of b's to a, then their mean.
 
     The mean, not the worse: where one scan saw more of an object than the other, only the way from the smaller to
     the larger tells right from wrong.
@@ -132,7 +132,7 @@ def two_way_rms(a: Sampled, b: Sampled, share: float) -> Float[Array, ""]:
 def chamfer_distance(
     a: Float[Array, "n 3"], a_mask: Bool[Array, " n"], b: Float[Array, "m 3"], b_mask: Bool[Array, " m"]
 ) -> Float[Array, ""]:
-    """Mean nearest distance a → b plus mean nearest distance b → a, metres; gradient 0 at coincidence."""
+    """Mean nearest distance a → b plus mean nearest distance b → a, meters; gradient 0 at coincidence."""
     total = jnp.zeros((), a.dtype)
     for (x, x_mask), (y, y_mask) in (((a, a_mask), (b, b_mask)), ((b, b_mask), (a, a_mask))):
         _, squared = nearest(x, x_mask, y, y_mask)
@@ -191,7 +191,7 @@ def dominant_eigenvector(matrix: Float[Array, "4 4"]) -> Float[Array, "4"]:
 
 
 def cloud_radius(points: Float[Array, "n 3"], mask: Bool[Array, " n"]) -> Float[Array, ""]:
-    """Largest distance from the mean, metres; at least 1e-6, so that a single point can be divided by it."""
+    """Largest distance from the mean, meters; at least 1e-6, so that a single point can be divided by it."""
     weight = mask / jnp.maximum(mask.sum(), 1)
     squared = jnp.sum((points - weight @ points) ** 2, axis=-1)
     return jnp.sqrt(jnp.maximum(jnp.where(mask, squared, 0.0).max(), 1e-12))

@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 V = TypeVar("V")
 
-# Inside Adam's square root: without it the gradient *through* the optimiser is NaN wherever a gradient is 0.
+# Inside Adam's square root: without it the gradient *through* the optimizer is NaN wherever a gradient is 0.
 EPS_ROOT = 1e-16
 
 
@@ -26,10 +26,10 @@ def adam(learning_rate: float) -> optax.GradientTransformation:
 def descend(
     loss_fn: Callable[[V], Float[Array, ""]],
     start: V,
-    optimiser: optax.GradientTransformation,
+    optimizer: optax.GradientTransformation,
     steps: int,
 ) -> tuple[V, Float[Array, ""]]:
-    """Minimises `loss_fn` from `start`; returns the best value seen and its loss. `steps` = 0 returns `start`.
+    """Minimizes `loss_fn` from `start`; returns the best value seen and its loss. `steps` = 0 returns `start`.
 
     `start` is a pytree of arrays and jaxlie groups; groups move along their tangent. A step whose loss is NaN is
     never kept.
@@ -40,10 +40,10 @@ def descend(
         value, state, best, best_loss = carry
         loss, gradient = value_and_grad(value)
         best, best_loss = keep_better(value, loss, best, best_loss)
-        updates, state = optimiser.update(gradient, state)
+        updates, state = optimizer.update(gradient, state)
         return (jaxlie.manifold.rplus(value, updates), state, best, best_loss), None
 
-    state = optimiser.init(jaxlie.manifold.zero_tangents(start))
+    state = optimizer.init(jaxlie.manifold.zero_tangents(start))
     (value, _, best, best_loss), _ = jax.lax.scan(
         step, (start, state, start, jnp.array(jnp.inf)), length=steps
     )

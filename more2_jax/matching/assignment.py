@@ -25,7 +25,7 @@ NEVER = -np.inf  # log odds of a pair that is no candidate
 def assign(odds: LogOdds, moved_m: Float[np.ndarray, "n m"], weight: float) -> Int[np.ndarray, "p 2"]:
     """The pairs (object, instance) of the likeliest assignment: none that is likelier two objects than one.
 
-    A metre moved takes `weight` off the log odds of pairs that are possible: it decides among identical copies.
+    A meter moved takes `weight` off the log odds of pairs that are possible: it decides among identical copies.
     """
     possible = odds > 0
     nearer = odds - weight * np.minimum(moved_m, FARTHEST_M)

@@ -21,12 +21,12 @@ class Compared:
     size: Float[np.ndarray, "*pairs"]  # |log| of the ratio of the F_s
     likeness: Float[np.ndarray, "*pairs"]  # cosine of the F_inv
     top_m: Float[np.ndarray, "*pairs"]  # difference of the heights of their highest points
-    color: Float[np.ndarray, "*pairs"]  # log likelihood ratio of their colours (`color.color_evidence`)
+    color: Float[np.ndarray, "*pairs"]  # log likelihood ratio of their colors (`color.color_evidence`)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Calibration:
-    """Log odds that two clouds show one object, linear in what is known of the pair (docs/relocalisation.md)."""
+    """Log odds that two clouds show one object, linear in what is known of the pair (docs/relocalization.md)."""
 
     intercept: float
     nearer: float  # of the smaller mean truncated distance of the two ways,
@@ -45,7 +45,7 @@ HIGHEST = 0.2
 UNKNOWN = 0.5  # of `off_own`: a prior that lays a cloud so far off its own surface has no say
 
 
-# Logistic regression on pairs of validation rooms; how, and how well it holds, is in docs/relocalisation.md.
+# Logistic regression on pairs of validation rooms; how, and how well it holds, is in docs/relocalization.md.
 UPRIGHT = Calibration(intercept=3.7, nearer=-6.9, farther=-1.0, size=-2.7, likeness=2.6, lift=-2.5, top=-21.0)
 
 
@@ -78,7 +78,7 @@ def log_odds(evidence: Evidence, compared: Compared, c: Calibration) -> Float[np
 
 
 def weighed(known: dict[str, Float[np.ndarray, "*pairs"]], c: Calibration) -> Float[np.ndarray, "*pairs"]:
-    """Log odds of what is known (`features`) by a calibration; without colours."""
+    """Log odds of what is known (`features`) by a calibration; without colors."""
     parts = [getattr(c, name) * value for name, value in known.items()]
     return c.intercept + np.sum(parts, axis=0)
 

@@ -112,13 +112,13 @@ def proposal_of(known: Compared, config: SceneConfig) -> LogOdds:
 
 
 def heights(side: Sequence[ObservedObject]) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
-    """Heights of every cloud's lowest and highest points, metres."""
+    """Heights of every cloud's lowest and highest points, meters."""
     low, high = np.array([np.quantile(k.points[:, 2], (1 - TOP, TOP)) for k in side]).T
     return low, high
 
 
 def compared(old: Sequence[ObservedObject], new: Sequence[ObservedObject]) -> Compared:
-    """Every object with every instance, by size, code, height and colour."""
+    """Every object with every instance, by size, code, height and color."""
     a, b = (np.array([float(k.embedding.scale) for k in side]) for side in (old, new))
     x, y = (np.stack([np.asarray(k.embedding.inv, np.float64) for k in side]) for side in (old, new))
     x, y = (v / np.maximum(np.linalg.norm(v, axis=1, keepdims=True), 1e-30) for v in (x, y))

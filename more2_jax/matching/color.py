@@ -1,6 +1,6 @@
-"""Colour as evidence of who is who, where both scans have it: identical copies of different colours are told apart.
+"""Color as evidence of who is who, where both scans have it: identical copies of different colors are told apart.
 
-Beyond the paper (preset `robust`). An object's colour is the mean of its points in CIE L*a*b*.
+Beyond the paper (preset `robust`). An object's color is the mean of its points in CIE L*a*b*.
 """
 
 from __future__ import annotations
@@ -13,22 +13,22 @@ from skimage.color import rgb2lab
 
 from more2_jax.types import Color
 
-# Standard deviations of differences in (L*, a*, b*). Assumptions, not fitted: no openly licensed pairs of coloured
+# Standard deviations of differences in (L*, a*, b*). Assumptions, not fitted: no openly licensed pairs of colored
 # scans with known identities are at hand.
 SAME = np.array([12.0, 8.0, 8.0])  # of one object in two scans: light, exposure and white balance differ
-DIFFERENT = np.array([25.0, 20.0, 20.0])  # of two objects, in a room of many colours
+DIFFERENT = np.array([25.0, 20.0, 20.0])  # of two objects, in a room of many colors
 ODD = 0.1  # probability that one object looks like another: painted, covered, lit by a lamp, seen from behind
 
 
 def color_of(colors: Integer[np.ndarray, "n 3"] | None) -> Color | None:
-    """The colour of points, RGB from 0 to 255 (sRGB); None without colours or points."""
+    """The color of points, RGB from 0 to 255 (sRGB); None without colors or points."""
     if colors is None or not len(colors):
         return None
     return Color(points=len(colors), lab=rgb2lab(np.asarray(colors) / 255.0).mean(axis=0))
 
 
 def pooled(*parts: Color | None) -> Color | None:
-    """The colour of the union of clouds, from theirs; those without colours do not count."""
+    """The color of the union of clouds, from theirs; those without colors do not count."""
     known = [c for c in parts if c is not None]
     if not known:
         return None
@@ -37,11 +37,11 @@ def pooled(*parts: Color | None) -> Color | None:
 
 
 def color_evidence(old: Sequence[Color | None], new: Sequence[Color | None]) -> Float[np.ndarray, "n m"]:
-    """Log likelihood ratio of every pair's colours: one object against two; 0 where either has none.
+    """Log likelihood ratio of every pair's colors: one object against two; 0 where either has none.
 
-    The difference of one object's colours is normal (`SAME`), but with probability `ODD` that of two objects;
+    The difference of one object's colors is normal (`SAME`), but with probability `ODD` that of two objects;
     so no pair loses more than log `ODD`. Differences of two objects are normal with the spread of the room's own
-    colours, `DIFFERENT` at most: things all of one colour, or a file that paints all alike, say nothing. A shift
+    colors, `DIFFERENT` at most: things all of one color, or a file that paints all alike, say nothing. A shift
     common to a scan (white balance) is not estimated: few objects could not tell it from objects exchanged.
     """
     a, b = (np.stack([np.full(3, np.nan) if c is None else c.lab for c in side]) for side in (old, new))
@@ -54,6 +54,6 @@ def color_evidence(old: Sequence[Color | None], new: Sequence[Color | None]) -> 
 
 
 def _spread(lab: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "3"]:
-    """Standard deviation of the difference of two objects' colours in one scan; infinite if fewer than two have any."""
+    """Standard deviation of the difference of two objects' colors in one scan; infinite if fewer than two have any."""
     known = lab[~np.isnan(lab).any(axis=1)]
     return np.sqrt(2 * known.var(axis=0, ddof=1)) if len(known) > 1 else np.full(3, np.inf)

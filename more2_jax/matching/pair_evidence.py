@@ -46,14 +46,14 @@ class Evidence:
         Array, "*pairs"
     ]  # mean truncated distance of the source's points, in shares of the truncation
     of_target: Float[Array, "*pairs"]  # and of the target's
-    lift: Float[Array, "*pairs"]  # change of height, metres
-    radius: Float[Array, "*pairs"]  # of the target, metres
+    lift: Float[Array, "*pairs"]  # change of height, meters
+    radius: Float[Array, "*pairs"]  # of the target, meters
     # How far, 0 to 1, the source's points lie off the target's completed surface, the target's off the source's, and
     # either off its own at most: what the prior does not even know. All 0 where that is not asked.
     off_source: Float[Array, "*pairs"]
     off_target: Float[Array, "*pairs"]
     off_own: Float[Array, "*pairs"]
-    poses: jaxlie.SE3  # (*pairs, `HYPOTHESES`): source's local frame to target's, best first, metres
+    poses: jaxlie.SE3  # (*pairs, `HYPOTHESES`): source's local frame to target's, best first, meters
 
 
 @partial(jax.jit, static_argnames=("config", "upright"))
@@ -70,7 +70,7 @@ def pair_evidence(
 ) -> Evidence:
     """Fits `pairs` (row of `source`, row of `target`) of two batches of clouds.
 
-    `offset`: where the source's local zero lies as the target sees it, when the scans share a frame, metres.
+    `offset`: where the source's local zero lies as the target sees it, when the scans share a frame, meters.
     """
 
     def prepared(cloud: PointCloud) -> Surface:

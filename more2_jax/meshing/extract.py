@@ -48,7 +48,7 @@ def extract_mesh(
     floor: float | None = None,
     seen_from: Float[np.ndarray, "n s 3"] | None = None,
 ) -> Mesh | None:
-    """A level set of one object's field, by default 0; metres in its scan's frame, always closed.
+    """A level set of one object's field, by default 0; meters in its scan's frame, always closed.
 
     `half_width` (canonical units) is half the edge of the query box. With `seen`, points of the surface in the
     scan's frame, and a `config.seen_reach`, the surface runs through them; each was seen from one of the places
@@ -107,19 +107,19 @@ def observed_level(prior: Prior, embedding: Embedding, points: Float[np.ndarray,
 
 
 def canonical(embedding: Embedding, points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
-    """Points of the scan's frame in canonical units, relative to the object's centre."""
+    """Points of the scan's frame in canonical units, relative to the object's center."""
     return (points - np.asarray(embedding.center, np.float64) - embedding.origin) / float(embedding.scale)
 
 
 def lowest_height(embedding: Embedding, floor: float | None) -> float:
-    """A floor's height (metres, the scan's frame) in canonical units, relative to the centre; −∞ if there is none."""
+    """A floor's height (meters, the scan's frame) in canonical units, relative to the center; −∞ if there is none."""
     return -np.inf if floor is None else float(canonical(embedding, np.array([[0.0, 0.0, floor]]))[0, 2])
 
 
 def _field(
     prior: Prior, embedding: Embedding, level: float, queries: Float[np.ndarray, "p 3"]
 ) -> Float[np.ndarray, " p"]:
-    """Field at canonical offsets from the centre, less `level`."""
+    """Field at canonical offsets from the center, less `level`."""
     return _in_chunks(_values, prior, embedding, queries) - level
 
 
@@ -129,7 +129,7 @@ def _drawn(
     queries: Float[np.ndarray, "p 3"],
     field: Float[np.ndarray, " p"],
 ) -> Float[np.ndarray, " p"]:
-    """The field drawn towards what was seen, and above `lowest`."""
+    """The field drawn toward what was seen, and above `lowest`."""
     values = field if seen is None else seen.corrected(queries, field)
     return np.maximum(values, lowest - queries[:, 2])
 

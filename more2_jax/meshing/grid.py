@@ -16,7 +16,7 @@ Points = Float[np.ndarray, "p 3"]
 
 @dataclass(frozen=True)
 class Lattice:
-    """Corners of cubic cells; canonical units, relative to the object's centre."""
+    """Corners of cubic cells; canonical units, relative to the object's center."""
 
     low: Float[np.ndarray, "3"]  # the first corner
     step: float  # edge of a cell

@@ -1,8 +1,8 @@
-"""Which side of a scanned surface is outside: by who saw it, by what lies behind it, by the field, by its neighbours.
+"""Which side of a scanned surface is outside: by who saw it, by what lies behind it, by the field, by its neighbors.
 
 A surface faces the sensor that saw it. Where sensors are not known, points alone do not tell: along the normal, matter
 ends sooner than free space does, a board's other face is nearer than the next shelf. Where nothing lies on either
-side, the field's slope decides. Votes are then made to agree over a signed graph of neighbours (after Hoppe et al.,
+side, the field's slope decides. Votes are then made to agree over a signed graph of neighbors (after Hoppe et al.,
 1992; here one sparse linear system instead of a spanning tree).
 """
 
@@ -15,7 +15,7 @@ from scipy.sparse.linalg import cg
 from scipy.spatial import KDTree
 
 Points = Float[np.ndarray, "n 3"]
-Neighbours = tuple[Float[np.ndarray, "n k"], Int[np.ndarray, "n k"]]  # distances and indices, nearest first
+Neighbors = tuple[Float[np.ndarray, "n k"], Int[np.ndarray, "n k"]]  # distances and indices, nearest first
 
 STEP, STEPS, FARTHEST = (
     1.35,
@@ -28,8 +28,8 @@ OF_FIELD = 0.3  # what the field's slope weighs, against 1 of the ratio of the w
 OF_SURROUNDINGS = 0.25  # what both weigh where sensors are known, against 1 of a sensor
 GRAZING = 0.2  # cosine from which on a sensor sees a side for sure
 VOTERS = 4096  # points that look around; the others hear them
-NEIGHBOURS = 10  # of a point, in the graph
-OWN_VOTE = 0.05  # what a vote weighs, against its neighbours' sum
+NEIGHBORS = 10  # of a point, in the graph
+OWN_VOTE = 0.05  # what a vote weighs, against its neighbors' sum
 SHARP = 8  # power of the agreement of two normals that makes an edge's weight: none across a crease
 
 
@@ -40,13 +40,13 @@ def outward_signs(
     gap: float,
     lowest: float,
     seen_from: Float[np.ndarray, "n s 3"] | None = None,
-    known: Neighbours | None = None,
+    known: Neighbors | None = None,
 ) -> Float[np.ndarray, " n"]:
     """+1 where a point's normal goes outward, −1 where inward.
 
     `tree` holds the points (canonical units); `slope` is by how much the field rises along the normal, −1 to 1; `gap`
     is the least way that counts; below the height `lowest` there is no free space. One of the places `seen_from`, if
-    they are known, saw the point; NaN fills up. `known`: the points' neighbours, if they were searched before.
+    they are known, saw the point; NaN fills up. `known`: the points' neighbors, if they were searched before.
     """
     points, few = np.asarray(tree.data), np.arange(0, tree.n, -(-tree.n // VOTERS))
     seen = np.zeros(len(few))
@@ -58,9 +58,7 @@ def outward_signs(
     vote[unsure] += np.clip(np.log(ways[0] / ways[1]), -1, 1)
     vote *= 1.0 if seen_from is None else OF_SURROUNDINGS
     vote[few] += seen
-    agreed, _ = cg(
-        *graph(points, normal, vote, known or neighbours_in(tree)), x0=vote, rtol=1e-3, maxiter=200
-    )
+    agreed, _ = cg(*graph(points, normal, vote, known or neighbors_in(tree)), x0=vote, rtol=1e-3, maxiter=200)
     return np.where(agreed < 0, -1.0, 1.0)
 
 
@@ -97,20 +95,20 @@ def first_met(
     return found
 
 
-def neighbours_in(tree: KDTree) -> Neighbours:
+def neighbors_in(tree: KDTree) -> Neighbors:
     """Of every point, itself first."""
-    distance, near = tree.query(np.asarray(tree.data), k=min(NEIGHBOURS + 1, tree.n))
+    distance, near = tree.query(np.asarray(tree.data), k=min(NEIGHBORS + 1, tree.n))
     return np.asarray(distance), np.asarray(near)
 
 
 def graph(
-    points: Points, normal: Points, vote: Float[np.ndarray, " n"], known: Neighbours
+    points: Points, normal: Points, vote: Float[np.ndarray, " n"], known: Neighbors
 ) -> tuple[csr_matrix, Float[np.ndarray, " n"]]:
-    """The linear system whose solution weighs every vote against those of neighbours, and its right-hand side.
+    """The linear system whose solution weighs every vote against those of neighbors, and its right-hand side.
 
     An edge's sign: whether two normals go to one side of a circle's arc through both points.
     """
-    distance, near = (x[:, 1 : NEIGHBOURS + 1] for x in known)
+    distance, near = (x[:, 1 : NEIGHBORS + 1] for x in known)
     i, j, d = np.repeat(np.arange(len(points)), near.shape[1]), near.ravel(), distance.ravel()
     along = (points[j] - points[i]) / np.maximum(d, 1e-12)[:, None]
     mirrored = normal[j] - 2 * np.einsum("ei,ei->e", normal[j], along)[:, None] * along

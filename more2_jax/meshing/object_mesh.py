@@ -34,7 +34,7 @@ MESHES_AT_ONCE = 8
 
 
 def floor_under(o: SceneObject, background: Float[np.ndarray, "b 3"], config: SceneConfig) -> float | None:
-    """Height of the floor in an object's frame, metres; `background` is that of its reference scan.
+    """Height of the floor in an object's frame, meters; `background` is that of its reference scan.
 
     None if it is not asked for, there is none to see, or the object was seen clearly below it: then it is another's.
     """

@@ -1,4 +1,4 @@
-"""Planes through neighbouring points of one cloud, their normals, and how rough the points are."""
+"""Planes through neighboring points of one cloud, their normals, and how rough the points are."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ WIDE = 0.05  # unless their second variance is a smaller share of the first: poi
 class Planes:
     """Of every point; normals have unit length and either sign."""
 
-    center: Float[Array | np.ndarray, "n 3"]  # the mean of its neighbours
+    center: Float[Array | np.ndarray, "n 3"]  # the mean of its neighbors
     normal: Float[Array | np.ndarray, "n 3"]  # of their plane of least squares
     off: Float[Array | np.ndarray, " n"]  # their variance off that plane
     spread: Float[Array | np.ndarray, " n"]  # and in all
@@ -28,7 +28,7 @@ class Planes:
 
 
 def planes_of(points: Float[np.ndarray, "n 3"], near: Int[np.ndarray, "n k"]) -> Planes:
-    """`planes` on the host, of a cloud of any size: padded by points that no neighbour of its own names."""
+    """`planes` on the host, of a cloud of any size: padded by points that no neighbor of its own names."""
     size = bucket(len(points), MIN_POINTS)
     cloud, rows = np.zeros((size, 3), np.float32), np.zeros((size, near.shape[1]), np.int32)
     cloud[: len(points)], rows[: len(points)] = points, near
@@ -38,7 +38,7 @@ def planes_of(points: Float[np.ndarray, "n 3"], near: Int[np.ndarray, "n k"]) ->
 
 @jax.jit
 def planes(points: Float[Array, "n 3"], near: Int[Array, "n k"]) -> Planes:
-    """The plane through each point's neighbours; `near` names them, nearest first, the point itself among them."""
+    """The plane through each point's neighbors; `near` names them, nearest first, the point itself among them."""
     center, normal, second = fitted(points, near)
     return Planes(
         center=center,
@@ -52,7 +52,7 @@ def planes(points: Float[Array, "n 3"], near: Int[Array, "n k"]) -> Planes:
 def fitted(
     points: Float[Array, "n 3"], near: Int[Array, "n k"]
 ) -> tuple[Float[Array, "n 3"], Float[Array, "n 3"], Float[Array, "n 3 3"]]:
-    """The neighbours' mean, the normal (of either sign) of their plane of least squares, and their covariance."""
+    """The neighbors' mean, the normal (of either sign) of their plane of least squares, and their covariance."""
     around = points[near]
     center = around.mean(axis=1)
     x, y, z = jnp.moveaxis(around - center[:, None], 2, 0)

@@ -22,7 +22,7 @@ from scipy.fft import irfftn, next_fast_len, rfftn
 from more2_jax.meshing.grid import Grid, Lattice, Points
 
 SOFT = 1.5  # cells on either side of the surface in which an indicator goes from 1 to 0
-AGREE = 0.5  # cosine from which on a neighbour's normal is of the same face,
+AGREE = 0.5  # cosine from which on a neighbor's normal is of the same face,
 CORNERS = np.array(list(itertools.product((0, 1), repeat=3)))  # of a cell
 FLAT = 0.1  # and share of its squared distance that it may lie off that face
 
@@ -90,9 +90,9 @@ def areas(
     distance: Float[np.ndarray, "p k"],
     near: Int[np.ndarray, "p k"],
 ) -> Float[np.ndarray, " p"]:
-    """The share of the surface each point stands for: of the disc that holds its neighbours on the same face.
+    """The share of the surface each point stands for: of the disc that holds its neighbors on the same face.
 
-    `near` names every point's neighbours, itself among them, nearest first, `distance` how far they are.
+    `near` names every point's neighbors, itself among them, nearest first, `distance` how far they are.
     """
     offset = points[near] - points[:, None]
     along = np.einsum("pki,pi->pk", offset, normals) ** 2

@@ -47,7 +47,7 @@ def bfloat16_product(h: Float[Array, "n i"], kernel: Float[Array, "i o"]) -> Flo
 
 
 class WeightNormDense(nn.Module):
-    """Dense layer with weight normalisation: kernel = gain · direction / |direction|, a column an output."""
+    """Dense layer with weight normalization: kernel = gain · direction / |direction|, a column an output."""
 
     features: int
 
@@ -83,7 +83,7 @@ class Decoder(nn.Module):
         self.dropout = nn.Dropout(d.dropout)
 
     def kernels(self) -> list[tuple[Float[Array, "i o"], Float[Array, " o"]]]:
-        """Every hidden layer's kernel and bias, weight normalisation applied."""
+        """Every hidden layer's kernel and bias, weight normalization applied."""
         d = self.config.decoder
         inputs = [self.input_width] + [d.hidden] * (d.layers - 1)
         if not d.narrow_skip:
@@ -140,5 +140,5 @@ class Decoder(nn.Module):
     def __call__(
         self, embedding: Embedding, points: Float[Array, "n 3"], train: bool = False
     ) -> Float[Array, " n"]:
-        """Signed distance of one object at `points`; canonical units: metres are the value times `scale`."""
+        """Signed distance of one object at `points`; canonical units: meters are the value times `scale`."""
         return self.distance(self.field(embedding), points, train)

@@ -43,7 +43,7 @@ def stack(
 
 
 def with_origin(e: Embedding, origin: Float[np.ndarray, "*b 3"]) -> Embedding:
-    """The same embedding, its centre relative to another origin; the difference is taken in float64."""
+    """The same embedding, its center relative to another origin; the difference is taken in float64."""
     center = np.asarray(e.center, np.float64) + np.asarray(e.origin) - origin
     return dataclasses.replace(e, center=jnp.asarray(center, jnp.float32), origin=np.asarray(origin))
 

@@ -1,4 +1,4 @@
-"""Encoder Φ (paper §3.1): a point cloud to an invariant, an equivariant, a scale and a centre code."""
+"""Encoder Φ (paper §3.1): a point cloud to an invariant, an equivariant, a scale and a center code."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from jax import Array
 from jaxtyping import Bool, Float
 
 from more2_jax.config import EncoderConfig
-from more2_jax.network.neighbor_scan import over_neighbours
+from more2_jax.network.neighbor_scan import over_neighbors
 from more2_jax.network.vector_neurons import (
     TINY,
     VNLA,
     EdgeParts,
     EdgeVNLA,
     VNLAWeights,
-    channel_normalise,
+    channel_normalize,
     edge_vnla,
     kernel_init,
     masked_mean,
@@ -35,7 +35,7 @@ Features = Float[Array, "n 3 c"]
 
 
 def divide_by_count(total: Features, real: Bool[Array, "n k"]) -> Features:
-    """The mean over the real neighbours, from the sum over them."""
+    """The mean over the real neighbors, from the sum over them."""
     return total / jnp.maximum(real.sum(axis=-1), 1)[:, None, None]
 
 
@@ -56,31 +56,31 @@ def power_of_two(x: Float[Array, ""]) -> Float[Array, ""]:
 
 
 class FirstBlock(nn.Module):
-    """VNLA on [x̂_i × x_j, x_j − x_i, x_i], mean over neighbours: the cross product makes three channels."""
+    """VNLA on [x̂_i × x_j, x_j − x_i, x_i], mean over neighbors: the cross product makes three channels."""
 
     config: EncoderConfig
 
     @nn.compact
     def __call__(self, points: Float[Array, "n 3"], mask: Bool[Array, "n"]) -> Features:
         c = self.config
-        index, real = nearest_points(points, mask, c.neighbours)
+        index, real = nearest_points(points, mask, c.neighbors)
         length = jnp.sqrt(jnp.maximum(jnp.sum(points**2, axis=-1), TINY))
         kernel, direction = VNLAWeights(3, c.widths[0], name="value")()
 
-        def edge(neighbour: Array, own: tuple[Array, Array], maps: tuple[Array, Array], real: Array) -> Any:
+        def edge(neighbor: Array, own: tuple[Array, Array], maps: tuple[Array, Array], real: Array) -> Any:
             unit, point = own
-            graph = jnp.cross(unit, neighbour), neighbour - point, point
+            graph = jnp.cross(unit, neighbor), neighbor - point, point
             q, k = (channels_of(graph, w) for w in maps)
             return vn_leaky_relu(q, k, c.leak, real[:, None, None]), ()
 
         # The direction is folded into the kernel: no product of matrices an edge.
         maps = (kernel, kernel @ direction)
         own, counted = (points / length[:, None], points), real.T.astype(points.dtype)
-        return divide_by_count(over_neighbours(edge, points, own, maps, counted, index)[0], real)
+        return divide_by_count(over_neighbors(edge, points, own, maps, counted, index)[0], real)
 
 
 class LinearBlock(nn.Module):
-    """VNLA on the graph feature, mean over neighbours."""
+    """VNLA on the graph feature, mean over neighbors."""
 
     config: EncoderConfig
     features: int
@@ -90,18 +90,18 @@ class LinearBlock(nn.Module):
         self, source: Float[Array, "m 3 i"], mask: Bool[Array, "m"], query: Float[Array, "n 3 i"]
     ) -> Features:
         c = self.config
-        index, real = nearest_features(query, source, mask, c.neighbours)
-        of_neighbour, of_self = EdgeVNLA(self.features, name="value")(source, query)
+        index, real = nearest_features(query, source, mask, c.neighbors)
+        of_neighbor, of_self = EdgeVNLA(self.features, name="value")(source, query)
         counted = real.T.astype(query.dtype)
 
-        def edge(neighbour: EdgeParts, own: EdgeParts, _: tuple[()], real: Array) -> Any:
-            return edge_vnla(neighbour, own, c.leak, real[:, None, None]), ()
+        def edge(neighbor: EdgeParts, own: EdgeParts, _: tuple[()], real: Array) -> Any:
+            return edge_vnla(neighbor, own, c.leak, real[:, None, None]), ()
 
-        return divide_by_count(over_neighbours(edge, of_neighbour, of_self, (), counted, index)[0], real)
+        return divide_by_count(over_neighbors(edge, of_neighbor, of_self, (), counted, index)[0], real)
 
 
 class AttentionBlock(nn.Module):
-    """Attention over the neighbours, then the mean over all points mixed back in (global context)."""
+    """Attention over the neighbors, then the mean over all points mixed back in (global context)."""
 
     config: EncoderConfig
     features: int
@@ -115,27 +115,27 @@ class AttentionBlock(nn.Module):
         query_mask: Bool[Array, "n"],
     ) -> Features:
         c = self.config
-        index, real = nearest_features(query, source, mask, c.neighbours)
-        asked = channel_normalise(VNLA(self.features, c.leak, name="query")(query))
+        index, real = nearest_features(query, source, mask, c.neighbors)
+        asked = channel_normalize(VNLA(self.features, c.leak, name="query")(query))
         key, own_key = EdgeVNLA(self.features, name="key")(source, query)
         value, own_value = EdgeVNLA(self.features, name="value")(source, query)
         heads = membership(self.features, c.head_channels)
 
-        def score(neighbour: EdgeParts, own: tuple[Array, EdgeParts], _: tuple[()], __: tuple[()]) -> Any:
+        def score(neighbor: EdgeParts, own: tuple[Array, EdgeParts], _: tuple[()], __: tuple[()]) -> Any:
             asked, parts = own
-            found = edge_vnla(neighbour, parts, c.leak)
+            found = edge_vnla(neighbor, parts, c.leak)
             along = jnp.matmul(paired(asked, found), heads, precision="highest")
             return (), (along, paired(found, found).sum(axis=-1, keepdims=True))
 
-        _, (along, squared) = over_neighbours(score, key, (asked, own_key), (), (), index)
+        _, (along, squared) = over_neighbors(score, key, (asked, own_key), (), (), index)
         logit = along * jax.lax.rsqrt(3.0 * c.head_channels * jnp.where(squared > TINY, squared, 1.0))
         weight = jax.nn.softmax(logit, axis=0, where=real.T[..., None])
 
-        def weighted(neighbour: EdgeParts, own: EdgeParts, _: tuple[()], weight: Array) -> Any:
+        def weighted(neighbor: EdgeParts, own: EdgeParts, _: tuple[()], weight: Array) -> Any:
             by_channel = jnp.matmul(weight, heads.T, precision="highest")
-            return edge_vnla(neighbour, own, c.leak, by_channel[:, None]), ()
+            return edge_vnla(neighbor, own, c.leak, by_channel[:, None]), ()
 
-        mixed, _ = over_neighbours(weighted, value, own_value, (), weight, index)
+        mixed, _ = over_neighbors(weighted, value, own_value, (), weight, index)
         context = jnp.broadcast_to(masked_mean(mixed, query_mask), mixed.shape)
         return VNLA(self.features, c.leak, name="context")(jnp.concatenate([mixed, context], axis=-1))
 
@@ -146,7 +146,7 @@ def membership(features: int, channels: int) -> Float[np.ndarray, "features head
 
 
 class Center(nn.Module):
-    """VN residual block to one vector: the centre's offset from the mean of the input."""
+    """VN residual block to one vector: the center's offset from the mean of the input."""
 
     hidden: int
     leak: float
@@ -169,22 +169,22 @@ class Encoder(nn.Module):
     def __call__(self, points: Float[Array, "n 3"], mask: Bool[Array, "n"]) -> Embedding:
         c = self.config
         mean = masked_mean(points, mask)
-        centred = jnp.where(mask[:, None], points - mean, 0.0)
-        radius = power_of_two(jnp.sqrt(masked_mean(jnp.sum(centred**2, axis=-1), mask)))
-        levels = self.blocks(centred / radius, mask)
+        centerd = jnp.where(mask[:, None], points - mean, 0.0)
+        radius = power_of_two(jnp.sqrt(masked_mean(jnp.sum(centerd**2, axis=-1), mask)))
+        levels = self.blocks(centerd / radius, mask)
         features, mask = levels[-1]
         head = VNLA(c.code, c.leak, shared_direction=True, name="head")(features)
         x = masked_mean(head, mask)
-        eqv = channel_normalise(x)
+        eqv = channel_normalize(x)
         turned = x @ self.param("invariant", kernel_init, (c.code, c.code))
         offset = Center(c.code // 2, c.leak, name="center")(x) * c.output_scale * radius
         return Embedding(
-            inv=jnp.sum(channel_normalise(turned) * eqv, axis=-2),
+            inv=jnp.sum(channel_normalize(turned) * eqv, axis=-2),
             eqv=eqv,
             scale=norm(x).mean() * c.output_scale * radius,
             center=mean + offset,
             origin=jnp.zeros(3, points.dtype),
-            anchors=tuple(anchors(centred - offset, *levels[i]) for i in self.keep),
+            anchors=tuple(anchors(centerd - offset, *levels[i]) for i in self.keep),
         )
 
     def blocks(
@@ -209,11 +209,11 @@ class Encoder(nn.Module):
 
 def anchors(offset: Float[Array, "n 3"], features: Float[Array, "a 3 f"], mask: Bool[Array, " a"]) -> Anchors:
     """The first rows of the cloud, as many as there are features, each feature brought to unit norm."""
-    return Anchors(offset=offset[: len(features)], features=channel_normalise(features), mask=mask)
+    return Anchors(offset=offset[: len(features)], features=channel_normalize(features), mask=mask)
 
 
-def neighbour_counts(config: EncoderConfig, points: int) -> list[int]:
-    """How many points every block chooses its neighbours from; each must be at least `neighbours`."""
+def neighbor_counts(config: EncoderConfig, points: int) -> list[int]:
+    """How many points every block chooses its neighbors from; each must be at least `neighbors`."""
     thinning = dict(zip(config.downsample_blocks, config.downsample_factors, strict=True))
     counts: list[int] = []
     for i in range(len(config.widths)):

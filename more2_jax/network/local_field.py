@@ -1,7 +1,7 @@
 """What the decoder reads beside the code: the encoder's features at the observed points around a query.
 
 A code of a few hundred numbers says what kind of object this is; where its surface runs is in the points. Around a
-query the anchors' features are blended by normalised Gaussian weights, each contributing its own linear function of
+query the anchors' features are blended by normalized Gaussian weights, each contributing its own linear function of
 the offset, as in moving least squares: F(p) = Σ_j w_j(p) (⟨p − x_j, B_j⟩ + b_j). The same weights give the anchors'
 mean and covariance, hence the plane they lie in and where the query stands from it: features that are averages of
 positions cannot say that. Invariant, since the B_j turn with the object, and a few matrix products for any number of
@@ -26,7 +26,7 @@ LEAST_SPREAD = 1e-4  # of the anchors, squared: below it one anchor has all the 
 
 @pytree
 class LocalField:
-    """One level's anchors, ready to be asked: canonical units, relative to the centre."""
+    """One level's anchors, ready to be asked: canonical units, relative to the center."""
 
     position: Float[Array, "a 3"]
     mask: Bool[Array, " a"]
@@ -117,7 +117,7 @@ class LocalLookup(nn.Module):
 def from_plane(
     q: Float[Array, "n 3"], center: Float[Array, "n 3"], second: Float[Array, "n 3 3"]
 ) -> tuple[Float[Array, "n 3"], Float[Array, "n 3"], Float[Array, " n"]]:
-    """Offsets of queries from their neighbourhood's mean, the part of them across its plane, and its spread.
+    """Offsets of queries from their neighborhood's mean, the part of them across its plane, and its spread.
 
     For points spread evenly in a plane the covariance is s/2 times the projection onto it, s its trace: no
     eigenvectors, so nothing jumps where two of them change places.

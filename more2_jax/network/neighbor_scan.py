@@ -1,7 +1,7 @@
-"""Sums and maps over a point's neighbours, one neighbour at a time: exact, and several times faster on CPUs.
+"""Sums and maps over a point's neighbors, one neighbor at a time: exact, and several times faster on CPUs.
 
 Written for all edges at once, a block's (n, k, 3, c) arrays pass through memory dozens of times, forward and
-backward. Here a scan over the k neighbours keeps (n, 3, c) arrays in the cache, and its backward pass computes
+backward. Here a scan over the k neighbors keeps (n, 3, c) arrays in the cache, and its backward pass computes
 every edge anew instead of storing it.
 """
 
@@ -23,7 +23,7 @@ IN_BOUNDS = (
 Edge = Callable[[Tree, Tree, Tree, Tree], tuple[Tree, Tree]]
 
 
-def over_neighbours(
+def over_neighbors(
     edge: Edge, source: Tree, own: Tree, shared: Tree, each: Tree, index: Int[Array, "n k"]
 ) -> tuple[Tree, Tree]:
     """`edge(source[index[:, j]], own, shared, each[j])` for j = 0 … k − 1; it returns (a, b), all (n, …).

@@ -12,7 +12,7 @@ from jax import Array
 from jaxtyping import Float
 
 from more2_jax.geometry.points import farthest_points
-from more2_jax.network.encoder import neighbour_counts
+from more2_jax.network.encoder import neighbor_counts
 from more2_jax.network.prior import Prior, encode_ordered, sdf_one
 from more2_jax.network.published_weights import PREFIX, prior_from_published
 from more2_jax.network.torch_checkpoint import DAMAGED
@@ -83,9 +83,9 @@ def check_prior(weights: Mapping[str, np.ndarray], reference: Mapping[str, np.nd
     prior = prior_from_published(weights, "checked")
     points = jnp.asarray(reference["points"], jnp.float32)
     encoder = prior.config.encoder
-    if (least := min(neighbour_counts(encoder, points.shape[1]))) < encoder.neighbours:
+    if (least := min(neighbor_counts(encoder, points.shape[1]))) < encoder.neighbors:
         raise ValueError(
-            f"{points.shape[1]} reference points leave a block {least}; needed {encoder.neighbours} or more"
+            f"{points.shape[1]} reference points leave a block {least}; needed {encoder.neighbors} or more"
         )
     embedding, distance = _run(prior, points, jnp.asarray(reference["queries"], jnp.float32))
     ours = {

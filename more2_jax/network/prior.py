@@ -1,4 +1,4 @@
-"""The prior: encoder, decoder and their weights; initialise, save, load, encode, query."""
+"""The prior: encoder, decoder and their weights; initialize, save, load, encode, query."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from jaxtyping import Bool, Float
 from more2_jax.config import PriorConfig, from_dict
 from more2_jax.geometry.points import farthest_points
 from more2_jax.network.decoder import Decoder, ObjectField
-from more2_jax.network.encoder import Encoder, neighbour_counts
+from more2_jax.network.encoder import Encoder, neighbor_counts
 from more2_jax.types import Embedding, PointCloud, pytree
 
 FORMAT = 1  # of weight files
@@ -37,19 +37,19 @@ class Prior:
 
 
 def init_prior(config: PriorConfig, key: Array, name: str = "random") -> Prior:
-    """Random weights. Raises ValueError if the last block would choose from fewer points than `neighbours`."""
+    """Random weights. Raises ValueError if the last block would choose from fewer points than `neighbors`."""
     e = config.encoder
-    if (least := min(neighbour_counts(e, e.points))) < e.neighbours:
-        raise ValueError(f"{e.points} points leave a block {least}; needed {e.neighbours} neighbours or more")
+    if (least := min(neighbor_counts(e, e.points))) < e.neighbors:
+        raise ValueError(f"{e.points} points leave a block {least}; needed {e.neighbors} neighbors or more")
     encoder_key, decoder_key = jax.random.split(key)
     points = jax.random.normal(encoder_key, (e.points, 3))
     mask = jnp.ones(e.points, bool)
-    encoder, embedding = _initialise(Encoder(e, keep=config.decoder.local_blocks), encoder_key, points, mask)
-    decoder, _ = _initialise(Decoder(config), decoder_key, embedding, points[:1])
+    encoder, embedding = _initialize(Encoder(e, keep=config.decoder.local_blocks), encoder_key, points, mask)
+    decoder, _ = _initialize(Decoder(config), decoder_key, embedding, points[:1])
     return Prior(params={"encoder": encoder, "decoder": decoder}, config=config, name=name)
 
 
-def _initialise(module: Encoder | Decoder, key: Array, *inputs: Any) -> tuple[dict[str, Any], Any]:
+def _initialize(module: Encoder | Decoder, key: Array, *inputs: Any) -> tuple[dict[str, Any], Any]:
     """Weights, and zeros in the output's shapes: no weight depends on the inputs, so nothing is computed of them."""
     output, _ = jax.eval_shape(module.init_with_output, key, *inputs)
     variables = jax.jit(module.init)(key, *inputs)
@@ -75,7 +75,7 @@ def _encode_many(prior: Prior, points: Float[Array, "b n 3"], mask: Bool[Array, 
 def encode(prior: Prior, cloud: PointCloud) -> Embedding:
     """Encodes a batch of clouds (from `pad_clouds`): Φ(sRX + t) = (F_inv, R·F_eqv, s·F_s, sR·F_c + t), paper §3.1.
 
-    Returns a batch of embeddings whose `center` is in metres relative to `origin`, which is the cloud's.
+    Returns a batch of embeddings whose `center` is in meters relative to `origin`, which is the cloud's.
     Raises ValueError when a cloud has no real point.
     """
     if cloud.points.ndim != 3:
@@ -108,7 +108,7 @@ def field_sdf(prior: Prior, field: ObjectField, points: Float[Array, "n 3"]) -> 
 
 
 def sdf_one(prior: Prior, embedding: Embedding, points: Float[Array, "n 3"]) -> Float[Array, " n"]:
-    """Ψ for one object: signed distance at local points, canonical units (metres are the value × F_s)."""
+    """Ψ for one object: signed distance at local points, canonical units (meters are the value × F_s)."""
     return field_sdf(prior, object_field(prior, embedding), points)
 
 
@@ -120,9 +120,9 @@ def _sdf_many(prior: Prior, embedding: Embedding, points: Float[Array, "b n 3"])
 def sdf(
     prior: Prior, embedding: Embedding, points: Float[Array | np.ndarray, "b n 3"]
 ) -> Float[Array, "b n"]:
-    """Signed distances of a batch of objects at points in each scan's frame (metres), canonical units.
+    """Signed distances of a batch of objects at points in each scan's frame (meters), canonical units.
 
-    Multiply by `embedding.scale` for metres; negative inside (paper §3.1). Raises ValueError on shapes that differ, and
+    Multiply by `embedding.scale` for meters; negative inside (paper §3.1). Raises ValueError on shapes that differ, and
     on embeddings that the decoder cannot be asked about.
     """
     check_embedding(prior, embedding, "sdf")

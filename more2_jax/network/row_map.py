@@ -28,7 +28,7 @@ def in_turn(
 
     if mesh is None or mesh.size == 1:
         return some(shared, rows)
-    # Said outright: left to itself, the compiler has every device look for the neighbours of all rows.
+    # Said outright: left to itself, the compiler has every device look for the neighbors of all rows.
     whole, split = PartitionSpec(), PartitionSpec(mesh.axis_names)
     share = jax.shard_map(some, mesh=mesh, in_specs=(whole, split), out_specs=split, check_vma=False)
     return share(shared, rows)

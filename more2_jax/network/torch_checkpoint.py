@@ -122,7 +122,7 @@ def _parameter(data: Any, *_unused: Any) -> Any:
 def read_checkpoint(path: str | Path) -> dict[str, np.ndarray]:
     """The tensors under `model_state_dict` of a PyTorch checkpoint, by name, each in its own dtype.
 
-    Needs no torch and runs no code from the file; optimiser state and the like are not even read. Raises
+    Needs no torch and runs no code from the file; optimizer state and the like are not even read. Raises
     ValueError, in one line, for a missing file, one that is no zip-format checkpoint (PyTorch ≥ 1.6 writes
     those), a damaged one, or one without `model_state_dict`.
     """

@@ -1,6 +1,6 @@
 """Vector-neuron layers (METHOD 1): features are (..., 3, channels); every layer commutes with rotations.
 
-No layer has a bias (a constant vector would not turn) and none normalises by a statistic of the batch.
+No layer has a bias (a constant vector would not turn) and none normalizes by a statistic of the batch.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
-LEAST_SPARE = 4  # so many candidates more than neighbours, or half as many, before exact distances decide
+LEAST_SPARE = 4  # so many candidates more than neighbors, or half as many, before exact distances decide
 TINY = 1e-30  # guards squared norms: far below any feature, so it changes none (1e-12 would)
 FAR = 1e30  # squared distance to a row that is not there: larger than any, yet finite
 NO_DIRECTION = 1e-19  # squared; its inverse square, in the gradient of a division, is still a float32
@@ -29,7 +29,7 @@ def norm(x: Float[Array, "*b 3 c"]) -> Float[Array, "*b c"]:
     return jnp.sqrt(jnp.maximum(jnp.sum(x * x, axis=-2), TINY))
 
 
-def channel_normalise(x: Float[Array, "*b 3 c"]) -> Float[Array, "*b 3 c"]:
+def channel_normalize(x: Float[Array, "*b 3 c"]) -> Float[Array, "*b 3 c"]:
     """Scales so that the squared lengths of all channels sum to 1 (unit direction times share of the norm)."""
     squared = jnp.sum(x * x, axis=(-2, -1), keepdims=True)
     # The choice comes before the root: behind it, an infinite slope times 0 would make the gradient NaN.
@@ -168,7 +168,7 @@ class VNLAWeights(nn.Module):
 
 
 class VNLA(nn.Module):
-    """VN-Linear, then VN-LeakyReLU along a learnt direction."""
+    """VN-Linear, then VN-LeakyReLU along a learned direction."""
 
     features: int
     leak: float
@@ -187,7 +187,7 @@ class EdgeVNLA(nn.Module):
     """VNLA on the graph feature [f_j − f_i, f_i], by the exact algebra of per-point products.
 
     Both the linear map and its direction are linear in f_j and in f_i, so each is a product per *point*, added
-    per edge: the same numbers as the plain form in tests/oracles.py, with `neighbours` times fewer
+    per edge: the same numbers as the plain form in tests/oracles.py, with `neighbors` times fewer
     multiplications. Returns what `edge_vnla` takes: of every source, and of every query.
     """
 
@@ -200,17 +200,17 @@ class EdgeVNLA(nn.Module):
         width = source.shape[-1]
         kernel = self.param("kernel", kernel_init, (2 * width, self.features))
         direction = self.param("direction", kernel_init, (self.features, self.features))
-        of_neighbour = linear(source, kernel[:width])
+        of_neighbor = linear(source, kernel[:width])
         of_self = linear(query, kernel[width:] - kernel[:width])
         # The direction after the product, not folded into one kernel: half the rounding at the same cost.
-        return (of_neighbour, linear(of_neighbour, direction)), (of_self, linear(of_self, direction))
+        return (of_neighbor, linear(of_neighbor, direction)), (of_self, linear(of_self, direction))
 
 
 def edge_vnla(
-    of_neighbour: EdgeParts, of_self: EdgeParts, leak: float, weight: Float[Array, "n 1 w"] | None = None
+    of_neighbor: EdgeParts, of_self: EdgeParts, leak: float, weight: Float[Array, "n 1 w"] | None = None
 ) -> Float[Array, "n 3 o"]:
     """VNLA of one edge a query, from its two parts, times `weight`."""
-    return vn_leaky_relu(of_neighbour[0] + of_self[0], of_neighbour[1] + of_self[1], leak, weight)
+    return vn_leaky_relu(of_neighbor[0] + of_self[0], of_neighbor[1] + of_self[1], leak, weight)
 
 
 def nearest_points(
@@ -238,7 +238,7 @@ def nearest_features(
     rows, columns = jnp.concatenate([2 * a, -ones], axis=-1), jnp.concatenate([b, squared[:, None]], axis=-1)
     closeness = jnp.matmul(rows, columns.T, precision="highest")
     _, candidate = jax.lax.top_k(closeness, min(k + max(k // 2, LEAST_SPARE), len(b)))
-    # The expansion cancels, and a swapped k-th neighbour moves the code by percents: the last word has the
+    # The expansion cancels, and a swapped k-th neighbor moves the code by percents: the last word has the
     # sum of squared differences.
     exact = jnp.sum((a[:, None] - b[candidate]) ** 2, axis=-1)
     nearest, rank = jax.lax.top_k(jnp.where(source_mask[candidate], -exact, -jnp.inf), k)

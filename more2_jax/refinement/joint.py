@@ -1,4 +1,4 @@
-"""Joint optimisation of one object's shape code and poses over all its observations (paper §3.5)."""
+"""Joint optimization of one object's shape code and poses over all its observations (paper §3.5)."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class Observations:
 
 
 def fit_jointly(prior: Prior, observations: Observations, config: JointConfig) -> JointFit:
-    """Optimises code and poses of a batch of objects in one call (paper §3.5); frame: the reference's local one.
+    """Optimizes code and poses of a batch of objects in one call (paper §3.5); frame: the reference's local one.
 
     Raises ValueError when an object has no reference observation.
     """
@@ -63,7 +63,7 @@ def fit_one(prior: Prior, seen: Observations, config: JointConfig) -> JointFit:
         code = dataclasses.replace(start, inv=free["inv"], eqv=free["eqv"], center=free["center"])
         return surface_loss(prior, code, free["pose"], seen) + departure(code, start)
 
-    best, lowest = descend(loss, free, optimiser(config), config.steps)
+    best, lowest = descend(loss, free, optimizer(config), config.steps)
     # The reference observation defines the frame: all is moved back by what it drifted.
     drift = jax.tree.map(lambda x: x[0], best["pose"]).inverse()
     code = dataclasses.replace(start, inv=best["inv"], eqv=best["eqv"], center=best["center"])
@@ -75,7 +75,7 @@ def fit_one(prior: Prior, seen: Observations, config: JointConfig) -> JointFit:
     )
 
 
-def optimiser(config: JointConfig) -> optax.GradientTransformation:
+def optimizer(config: JointConfig) -> optax.GradientTransformation:
     """Adam with the paper's own step size for every variable."""
     rates = {
         "inv": config.inv_learning_rate,

@@ -1,4 +1,4 @@
-"""Joint optimisation of a scene's objects (paper §3.5): records to one padded batch, and back."""
+"""Joint optimization of a scene's objects (paper §3.5): records to one padded batch, and back."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def embed_accumulated(
 def fit_objects(
     prior: Prior, objects: Sequence[SceneObject], chosen: Sequence[int], config: SceneConfig
 ) -> list[SceneObject]:
-    """Optimises code and poses of the `chosen` objects over all their observations, in one call."""
+    """Optimizes code and poses of the `chosen` objects over all their observations, in one call."""
     result = list(objects)
     if not chosen:
         return result

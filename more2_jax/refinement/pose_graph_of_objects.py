@@ -39,7 +39,7 @@ def close_objects(
 ) -> list[SceneObject]:
     """The `chosen` objects with poses of their observations that agree with one another, the first held.
 
-    `floors`: the height of each chosen object's floor in its frame, metres, None where it is not known. What was seen
+    `floors`: the height of each chosen object's floor in its frame, meters, None where it is not known. What was seen
     has no sides where meshes are not drawn to it (`meshing.seen_reach` 0); then all stays as it is. Where codes are of
     all that was accumulated, they are made anew.
     """
@@ -107,7 +107,7 @@ def gather(rows: Sequence[Sequence[SeenSurface | None]], most: int, size: int) -
 
 
 def moved_by(o: SceneObject, moves: np.ndarray, most_turn_deg: float) -> SceneObject:
-    """The object with its observations moved, in canonical units about its centre; its cloud follows.
+    """The object with its observations moved, in canonical units about its center; its cloud follows.
 
     A move that is not finite, or turns farther than `most_turn_deg`, is none: poses are made better here, not found.
     """

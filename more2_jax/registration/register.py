@@ -111,15 +111,15 @@ def register_one(prior: Prior, pair: Pair, config: RegistrationConfig, upright: 
     pair = rescale(pair, 1 / radius)
     starts = candidate_poses(pair, config, upright)
     if config.refine == "surface":
-        return in_metres(register_surfaces(prior, starts, pair, config, upright), radius)
+        return in_meters(register_surfaces(prior, starts, pair, config, upright), radius)
     starts = keep_best(starts, pair, config)
     refined = jax.vmap(lambda T: refine(prior, T, pair, config))(starts)
     if config.identity_start:
         refined = with_stayed(prior, refined, pair, config)
-    return in_metres(choose(refined, config), radius)
+    return in_meters(choose(refined, config), radius)
 
 
-def in_metres(result: Registration, radius: Float[Array, ""]) -> Registration:
+def in_meters(result: Registration, radius: Float[Array, ""]) -> Registration:
     """A registration found in units of `radius`."""
 
     def scaled(T: jaxlie.SE3) -> jaxlie.SE3:

@@ -23,7 +23,7 @@ class Pair:
     target: Sampled
     source_code: Embedding
     target_code: Embedding
-    offset: Float[Array, "*b 3"]  # source's origin minus target's, metres, in the frame both scans share
+    offset: Float[Array, "*b 3"]  # source's origin minus target's, meters, in the frame both scans share
     source_sight: Sight | None = None  # what was seen around each, where sensors are known
     target_sight: Sight | None = None
 
@@ -35,7 +35,7 @@ def embedding_pose(source: Embedding, target: Embedding) -> jaxlie.SE3:
 
 
 def candidate_poses(pair: Pair, config: RegistrationConfig, upright: bool) -> jaxlie.SE3:
-    """All starts of a pair, batched: every rotation about the codes' centres and about the clouds' means.
+    """All starts of a pair, batched: every rotation about the codes' centers and about the clouds' means.
 
     Upright, in scans of one frame, those about the means keep their height: what stands on the floor stays there."""
     if config.starts == "embedding":
@@ -68,7 +68,7 @@ def yaw_of(matrix: Float[Array, "*b 3 3"]) -> Float[Array, "*b"]:
 def place(
     rotations: jaxlie.SO3, source_center: Float[Array, "3"], target_center: Float[Array, "3"]
 ) -> jaxlie.SE3:
-    """Poses with the given rotations that bring one centre onto the other."""
+    """Poses with the given rotations that bring one center onto the other."""
 
     def one(rotation: jaxlie.SO3) -> jaxlie.SE3:
         return jaxlie.SE3.from_rotation_and_translation(rotation, target_center - rotation @ source_center)

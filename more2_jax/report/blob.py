@@ -1,4 +1,4 @@
-"""Arrays of a page in one stretch of text: quantised to 16 bit, joined, deflated, base64."""
+"""Arrays of a page in one stretch of text: quantized to 16 bit, joined, deflated, base64."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Blob:
         return reference
 
     def add_points(self, points: Float[np.ndarray, "n 3"]) -> dict[str, Any]:
-        """Appends points, metres, on a grid of 65,536 steps along the longest side of their box.
+        """Appends points, meters, on a grid of 65,536 steps along the longest side of their box.
 
         The reference says how to have them back: `low + step * integers`.
         """

@@ -17,7 +17,7 @@ TOLERANCE = 0.03  # of the mesh's diagonal: nearer counts as seen
 def coverage(mesh: Mesh, points: Float[np.ndarray, "n 3"]) -> float:
     """Share of the mesh's surface, 0 to 1, that has a scanned point within 3 % of the object's diagonal.
 
-    Both in the same frame, metres. Where a cloud is so thin that its points lie further apart, twice their
+    Both in the same frame, meters. Where a cloud is so thin that its points lie further apart, twice their
     median spacing counts instead: a sparse scan is not a partial one. 0 without points or surface.
     """
     surface = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)

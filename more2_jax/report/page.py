@@ -62,7 +62,7 @@ def report_html(scene: LivingScene, config: SceneConfig) -> str:
         scene=_inert(json.dumps(data, separators=(",", ":"), allow_nan=False)),
         blob=blob,
         library=_asset("three.min.js"),
-        licence=escape(_asset("three.LICENSE")),
+        license=escape(_asset("three.LICENSE")),
         program="\n".join(_asset(f"{name}.js") for name in PROGRAM),
     )
 

@@ -1,4 +1,4 @@
-"""A colour for every object that people who see colours differently can tell apart."""
+"""A color for every object that people who see colors differently can tell apart."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ ROUNDS = (0.0, -0.3, 0.35, -0.5, 0.55)  # later rounds of the same hues: darker 
 
 
 def rgb(number: int) -> tuple[int, int, int]:
-    """The colour of object `number`, 0 to 255 a channel; ten hues, repeated darker and lighter."""
+    """The color of object `number`, 0 to 255 a channel; ten hues, repeated darker and lighter."""
     red, green, blue = (
         _shade(c, ROUNDS[number // len(BASE) % len(ROUNDS)]) for c in BASE[number % len(BASE)]
     )
@@ -38,7 +38,7 @@ def color(number: int) -> str:
 
 
 def ink(number: int) -> str:
-    """Black or white, whichever reads better on the object's colour (WCAG relative luminance)."""
+    """Black or white, whichever reads better on the object's color (WCAG relative luminance)."""
     linear = [
         c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4 for c in (v / 255 for v in rgb(number))
     ]

@@ -46,7 +46,7 @@ def payload(scene: LivingScene, config: SceneConfig) -> tuple[dict[str, Any], st
     """The page's data: what goes in as JSON, and the text of its `Blob`.
 
     Everything lies relative to the scene's middle, so that 32 bit floats of a graphics card are enough
-    kilometres away from the frame's zero. Lengths are metres, rotations quaternions (x, y, z, w).
+    kilometers away from the frame's zero. Lengths are meters, rotations quaternions (x, y, z, w).
     """
     blob = Blob()
     clouds = [

@@ -88,7 +88,7 @@ def phrase(v: Verdict) -> str:
 
 
 def _moved(distance_m: float, angle_deg: float) -> str:
-    """`moved by 1.20 m and turned by 35°`; below a centimetre or a degree only the other is said."""
+    """`moved by 1.20 m and turned by 35°`; below a centimeter or a degree only the other is said."""
     far, turned = distance_m >= 0.01, angle_deg >= 0.5
     length = f"{100 * distance_m:.0f} cm" if distance_m < 1 else f"{distance_m:.2f} m"
     if far and turned:

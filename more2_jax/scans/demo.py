@@ -29,7 +29,7 @@ class DemoTruth:
     instances: tuple[TrueInstance, ...]
     symmetry_order: dict[str, int]  # of a model about its vertical: 1 none, 2, 4, 0 any angle
     names: dict[str, str]  # of a model, for people
-    surfaces: dict[str, Float[np.ndarray, "_ 3"]]  # metres, model frame
+    surfaces: dict[str, Float[np.ndarray, "_ 3"]]  # meters, model frame
 
     def at(self, scan: int, instance: int) -> TrueInstance:
         """The truth of one instance. Raises KeyError if the scan has none of that number."""

@@ -17,10 +17,10 @@ LARGEST_GRID = 2**20  # voxels along an axis
 
 @dataclass(frozen=True)
 class SegmentationConfig:
-    """Settings of `segment_geometric`; lengths in metres."""
+    """Settings of `segment_geometric`; lengths in meters."""
 
     voxel_m: float = 0.03
-    normal_neighbours: int = 20
+    normal_neighbors: int = 20
     plane_distance_m: float = 0.05  # a voxel this near belongs to the plane
     plane_angle_deg: float = 30.0  # and if its normal turns less than this from the plane's
     plane_tries: int = 400
@@ -30,11 +30,11 @@ class SegmentationConfig:
     structure_share: float = 0.35  # of the scene's extent that a floor or wall spans at least
     room_m: float = 1.8  # floor and ceiling, or two facing walls, are this far apart: a table top is neither
     link_m: float = 0.06  # voxels this near touch where points are dense
-    dense_points: float = 3.0  # a voxel, on average among neighbours
-    link_spacing: float = 2.0  # where points are sparse: times the distance of the last core neighbour
+    dense_points: float = 3.0  # a voxel, on average among neighbors
+    link_spacing: float = 2.0  # where points are sparse: times the distance of the last core neighbor
     largest_link_m: float = 0.2
-    core_neighbours: int = 9  # fewer within reach: a voxel joins no two parts
-    join_area_m2: float = 0.1  # a smaller cluster is a piece of a neighbour
+    core_neighbors: int = 9  # fewer within reach: a voxel joins no two parts
+    join_area_m2: float = 0.1  # a smaller cluster is a piece of a neighbor
     join_m: float = 0.15  # if one is this near
     flat_m: float = 0.15  # a cluster that lies this close to a floor or wall is a part of it
     flat_share: float = 0.9  # with this share of its voxels
@@ -73,7 +73,7 @@ class Segmentation:
 
 
 def segment_geometric(points: Float[np.ndarray, "n 3"], config: SegmentationConfig) -> Segmentation:
-    """Cuts a cloud (metres, any frame) into floor, walls and clusters; the seed decides alone.
+    """Cuts a cloud (meters, any frame) into floor, walls and clusters; the seed decides alone.
 
     A plane is floor, wall or ceiling if it is large, spans much of the scene, has nearly nothing beyond it, and
     is not just over or before another: no direction is taken for up, and a table top over a floor stays. How far
@@ -83,7 +83,7 @@ def segment_geometric(points: Float[np.ndarray, "n 3"], config: SegmentationConf
     if not len(points):
         return Segmentation(instance=np.zeros(0, np.int64), planes=(), skipped=())
     voxels, voxel_of = _voxels(points, config.voxel_m)
-    normals = _normals(voxels, config.normal_neighbours)
+    normals = _normals(voxels, config.normal_neighbors)
     planes, structure = _planes(voxels, normals, config)
     cluster = np.full(len(voxels), -1)
     cluster[~structure] = _clusters(voxels[~structure], np.bincount(voxel_of)[~structure], config)
@@ -107,20 +107,20 @@ def _voxels(
     return np.stack(sums, axis=-1) / count[:, None], voxel_of
 
 
-def _normals(voxels: Float[np.ndarray, "v 3"], neighbours: int) -> Float[np.ndarray, "v 3"]:
+def _normals(voxels: Float[np.ndarray, "v 3"], neighbors: int) -> Float[np.ndarray, "v 3"]:
     """Direction of least spread among the nearest voxels; its sign means nothing."""
-    k = min(neighbours, len(voxels))
+    k = min(neighbors, len(voxels))
     near = KDTree(voxels).query(voxels, k=k)[1].reshape(len(voxels), k)
-    centred = voxels[near] - voxels[near].mean(axis=1, keepdims=True)
-    return np.linalg.eigh(np.einsum("vki,vkj->vij", centred, centred))[1][:, :, 0]
+    centerd = voxels[near] - voxels[near].mean(axis=1, keepdims=True)
+    return np.linalg.eigh(np.einsum("vki,vkj->vij", centerd, centerd))[1][:, :, 0]
 
 
 def _extent(points: Float[np.ndarray, "n 3"]) -> float:
     """Length along the direction of greatest spread, in any frame the same."""
     if not len(points):
         return 0.0
-    centred = points - points.mean(axis=0)
-    return float(np.ptp(centred @ np.linalg.eigh(centred.T @ centred)[1][:, -1]))
+    centerd = points - points.mean(axis=0)
+    return float(np.ptp(centerd @ np.linalg.eigh(centerd.T @ centerd)[1][:, -1]))
 
 
 # --- planes -------------------------------------------------------------------------------------------------
@@ -223,12 +223,12 @@ def _clusters(
 ) -> Int[np.ndarray, "v"]:
     """DBSCAN whose radius follows the spacing of the points (`counts` a voxel); -1 for noise."""
     cluster = np.full(len(voxels), -1)
-    k = min(config.normal_neighbours, len(voxels) - 1)
-    if k < config.core_neighbours:
+    k = min(config.normal_neighbors, len(voxels) - 1)
+    if k < config.core_neighbors:
         return cluster
     distance, near = (np.asarray(found)[:, 1:] for found in KDTree(voxels).query(voxels, k=k + 1))
-    last = distance[:, config.core_neighbours - 1]
-    dense = counts[near[:, : config.core_neighbours]].mean(axis=1) >= config.dense_points
+    last = distance[:, config.core_neighbors - 1]
+    dense = counts[near[:, : config.core_neighbors]].mean(axis=1) >= config.dense_points
     sparse_reach = np.clip(config.link_spacing * last, config.link_m, config.largest_link_m)
     reach = np.where(dense, config.link_m, sparse_reach)
     core = last <= reach

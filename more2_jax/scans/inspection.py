@@ -16,7 +16,7 @@ FLOOR_SHARE = 0.12  # of all points in one end slab makes it a floor; an even sp
 
 @dataclass(frozen=True, kw_only=True)
 class InstanceReport:
-    """One instance in figures; metres, along the scan's axes."""
+    """One instance in figures; meters, along the scan's axes."""
 
     id: int
     label: str | None
@@ -27,7 +27,7 @@ class InstanceReport:
 
 @dataclass(frozen=True, kw_only=True)
 class ScanReport:
-    """One scan in figures; metres."""
+    """One scan in figures; meters."""
 
     name: str
     source: str

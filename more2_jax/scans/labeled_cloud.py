@@ -36,7 +36,7 @@ class ReadOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
-class LabelledCloud:
+class LabeledCloud:
     """Points with the instance they belong to."""
 
     points: Float[np.ndarray, "n 3"]  # float64, in the file's unit

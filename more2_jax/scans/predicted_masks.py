@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from more2_jax.scans.files.npz import read_arrays
-from more2_jax.scans.labeled_cloud import LabelledCloud, instance_ids, one_line
+from more2_jax.scans.labeled_cloud import LabeledCloud, instance_ids, one_line
 from more2_jax.types import Skipped
 
 PER_POINT = ("objectId", "instance")  # arrays of an NPZ with one instance a point
@@ -25,7 +25,7 @@ class Mask:
     label: str | None = None
 
 
-def lay_masks(cloud: LabelledCloud, scan: Path, path: Path, min_score: float) -> LabelledCloud:
+def lay_masks(cloud: LabeledCloud, scan: Path, path: Path, min_score: float) -> LabeledCloud:
     """The cloud with the masks as its instances, numbered from 1 as the file lists them.
 
     `path` is a benchmark file (`<scene>.txt`, a line an instance: mask file, class, score), an NPZ with `masks`
@@ -50,12 +50,12 @@ def lay_masks(cloud: LabelledCloud, scan: Path, path: Path, min_score: float) ->
     return _laid(bare, masks, min_score)
 
 
-def _of_points(cloud: LabelledCloud, values: np.ndarray) -> np.ndarray:
+def _of_points(cloud: LabeledCloud, values: np.ndarray) -> np.ndarray:
     """Values of the file's rows at those rows that are points: a range camera's file has rows without depth."""
     return values if cloud.rows is None else values[cloud.rows]
 
 
-def _laid(cloud: LabelledCloud, masks: list[Mask], min_score: float) -> LabelledCloud:
+def _laid(cloud: LabeledCloud, masks: list[Mask], min_score: float) -> LabeledCloud:
     instance = np.zeros(len(cloud.points), np.int64)
     skipped, chosen = [], []
     for i, mask in enumerate(masks, 1):
@@ -88,7 +88,7 @@ def _of_scan(scan: Path, path: Path) -> Path:
     return max(files, key=lambda f: len(f.stem))
 
 
-def _check_count(file: Path, name: str, values: np.ndarray, cloud: LabelledCloud) -> None:
+def _check_count(file: Path, name: str, values: np.ndarray, cloud: LabeledCloud) -> None:
     if values.shape != (cloud.file_rows,):
         found = len(values) if values.ndim == 1 else values.shape
         raise ValueError(f"{file}: {name} is for {found} points; the scan has {cloud.file_rows}")
@@ -106,7 +106,7 @@ def _arrays(file: Path) -> dict[str, np.ndarray]:
     return arrays
 
 
-def _from_arrays(file: Path, arrays: dict[str, np.ndarray], cloud: LabelledCloud) -> list[Mask]:
+def _from_arrays(file: Path, arrays: dict[str, np.ndarray], cloud: LabeledCloud) -> list[Mask]:
     masks, n = arrays["masks"], cloud.file_rows
     if masks.ndim != 2 or len(masks) != n:
         raise ValueError(f"{file}: masks have shape {masks.shape}; needed ({n}, instances) for this scan")
@@ -136,7 +136,7 @@ def _text(label: np.generic) -> str:
 # --- the benchmark's text files ---------------------------------------------------------------------------------
 
 
-def _from_benchmark(file: Path, cloud: LabelledCloud) -> list[Mask]:
+def _from_benchmark(file: Path, cloud: LabeledCloud) -> list[Mask]:
     try:
         lines = file.read_text(encoding="utf-8").splitlines()
     except (OSError, ValueError) as error:

@@ -1,4 +1,4 @@
-"""Scans as people have them, read into a `Scan` by whichever of `FORMATS` recognises the path."""
+"""Scans as people have them, read into a `Scan` by whichever of `FORMATS` recognizes the path."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from jaxtyping import Float, Int
 
 from more2_jax.scans.formats.registry import FORMATS, WITH_DEPTH_FRAMES
 from more2_jax.scans.geometric_segmentation import SegmentationConfig, segment_geometric
-from more2_jax.scans.labeled_cloud import LabelledCloud, ReadOptions, one_line
+from more2_jax.scans.labeled_cloud import LabeledCloud, ReadOptions, one_line
 from more2_jax.scans.predicted_masks import lay_masks
 from more2_jax.types import Instance, Scan, Skipped
 
@@ -36,7 +36,7 @@ def read_scan(
     segment: Literal["geometric"] | None = None,
     depth_frames: bool = False,
 ) -> Scan:
-    """Reads one scan: instances in metres (float64, the scan's own frame), and what was left out.
+    """Reads one scan: instances in meters (float64, the scan's own frame), and what was left out.
 
     `path` is a PLY whose vertices carry an integer property naming the instance (`instance`, `instance_id`,
     `objectId`, `object_id` or `label`, in this order; `instance_property` names another), an NPZ with
@@ -67,7 +67,7 @@ def read_scan(
     return _scan(path, cloud, unit, min_points)
 
 
-def _segmented(path: Path, cloud: LabelledCloud, unit: str) -> LabelledCloud:
+def _segmented(path: Path, cloud: LabeledCloud, unit: str) -> LabeledCloud:
     """Clusters as instances where the cloud has none of its own; says what was done."""
     if cloud.instance is not None:
         said = "the scan has instance masks, so --segment geometric is not used"
@@ -87,12 +87,12 @@ def _segmented(path: Path, cloud: LabelledCloud, unit: str) -> LabelledCloud:
     )
 
 
-def _read(path: Path, options: ReadOptions) -> LabelledCloud:
-    """What the first format that recognises the path reads."""
+def _read(path: Path, options: ReadOptions) -> LabeledCloud:
+    """What the first format that recognizes the path reads."""
     if not path.exists():
         raise ValueError(f"{path}: no such file or folder")
     for form in FORMATS:
-        if form.recognises(path):
+        if form.recognizes(path):
             if options.depth_frames and form not in WITH_DEPTH_FRAMES:
                 raise ValueError(f"{path}: depth frames asked for; needed the folder of a 3RScan scan")
             try:
@@ -121,10 +121,10 @@ def _check_points(path: Path, points: Float[np.ndarray, "n 3"]) -> None:
         )
 
 
-# --- from labelled points to instances ----------------------------------------------------------------------
+# --- from labeled points to instances ----------------------------------------------------------------------
 
 
-def _scan(path: Path, cloud: LabelledCloud, unit: str, min_points: int) -> Scan:
+def _scan(path: Path, cloud: LabeledCloud, unit: str, min_points: int) -> Scan:
     unit = cloud.unit or unit
     if cloud.instance is None:
         raise ValueError(
@@ -148,7 +148,7 @@ def _scan(path: Path, cloud: LabelledCloud, unit: str, min_points: int) -> Scan:
     )
 
 
-def sensors_of(path: Path, cloud: LabelledCloud) -> Float[np.ndarray, "s 3"]:
+def sensors_of(path: Path, cloud: LabeledCloud) -> Float[np.ndarray, "s 3"]:
     """Where the scan's sensors stood: what `<scan>.sensors.txt` beside it says, else what the scan itself says.
 
     A line a place, x y z as the scan's points. None (0 rows) where neither says. Raises ValueError, in one line,
@@ -169,7 +169,7 @@ def sensors_of(path: Path, cloud: LabelledCloud) -> Float[np.ndarray, "s 3"]:
 
 
 def _instances(
-    cloud: LabelledCloud, instance: Int[np.ndarray, " n"], points: Float[np.ndarray, "n 3"], min_points: int
+    cloud: LabeledCloud, instance: Int[np.ndarray, " n"], points: Float[np.ndarray, "n 3"], min_points: int
 ) -> tuple[tuple[Instance, ...], tuple[Skipped, ...]]:
     """Splits the points by instance in one sort; ids ascend, points keep the file's order."""
     order = np.argsort(instance, kind="stable")
@@ -188,7 +188,7 @@ def _instances(
     return tuple(kept), tuple(skipped)
 
 
-def _label(cloud: LabelledCloud, index: int, rows: np.ndarray) -> str | None:
+def _label(cloud: LabeledCloud, index: int, rows: np.ndarray) -> str | None:
     """What most of the instance's points say; the first in order where two say it equally often."""
     if cloud.point_labels is None:
         return cloud.labels.get(index)

@@ -7,7 +7,7 @@ from jaxtyping import Int
 
 from more2_jax.types import Skipped
 
-# As `normalised` writes them; from the label sets of 3RScan, ScanNet, ScanNet++, Replica and S3DIS.
+# As `normalized` writes them; from the label sets of 3RScan, ScanNet, ScanNet++, Replica and S3DIS.
 STRUCTURE = frozenset(
     (
         *("wall", "inner wall", "half wall", "floor", "ceiling", "suspended ceiling", "roof"),
@@ -19,19 +19,19 @@ STRUCTURE = frozenset(
     )
 )
 NOT_OBJECTS = frozenset(
-    ("unlabeled", "unlabelled", "unannotated", "undefined", "unknown", "void", "none", "remove", "split", "")
+    ("unlabeled", "unlabeled", "unannotated", "undefined", "unknown", "void", "none", "remove", "split", "")
 )
 BACKGROUND_LABELS = STRUCTURE | NOT_OBJECTS
 
 
-def normalised(label: str) -> str:
+def normalized(label: str) -> str:
     """Lower case, words parted by one blank: `Door-Frame` and `door_frame` become `door frame`."""
     return " ".join(label.lower().replace("_", " ").replace("-", " ").split())
 
 
 def is_background(label: str | None) -> bool:
     """Whether the label names a part of the room or no object at all; False for an instance without a label."""
-    return label is not None and normalised(label) in BACKGROUND_LABELS
+    return label is not None and normalized(label) in BACKGROUND_LABELS
 
 
 def drop_background(

@@ -1,6 +1,6 @@
 """`3RScan.json` (METHOD 8): which scans show the same place, what moved between them, and how.
 
-The file's matrices are 16 numbers, column by column; here they are row-major, float64, metres. Two of its
+The file's matrices are 16 numbers, column by column; here they are row-major, float64, meters. Two of its
 directions differ, and this module turns both the same way:
 
 - `transform` of a rescan takes points of the rescan to the reference: kept as `T_ref_rescan`;
@@ -50,7 +50,7 @@ CATEGORIES = (
 )
 SPLITS = ("train", "validation", "test")
 SYMMETRY_FOLDS = {0: 1, 1: 2, 2: 4}  # class in the file → turns about the vertical that look alike
-MM_FROM = 100.0  # a shift beyond this is no room in metres: the first release had millimetres
+MM_FROM = 100.0  # a shift beyond this is no room in meters: the first release had millimeters
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -233,7 +233,7 @@ def _rows(row: dict, key: str, where: str) -> list[dict]:
 
 
 def _matrix(row: dict, where: str, scale: float) -> Float[np.ndarray, "4 4"]:
-    """Row-major from the file's columns; `scale` makes the shift metres."""
+    """Row-major from the file's columns; `scale` makes the shift meters."""
     numbers = _sixteen(row.get("transform"))
     if numbers is None:
         raise ValueError(f"{where}: transform is not 16 numbers, column by column")
@@ -253,7 +253,7 @@ def _sixteen(values: Any) -> Float[np.ndarray, "16"] | None:
 
 
 def _translation_scale(rows: list[dict]) -> float:
-    """Metres in a unit of the file's shifts: releases differ, within a file they do not."""
+    """Meters in a unit of the file's shifts: releases differ, within a file they do not."""
     scans = [scan for row in rows if isinstance(row.get("scans"), list) for scan in row["scans"]]
     found = (_sixteen(scan.get("transform")) for scan in scans if isinstance(scan, dict))
     largest = max(

@@ -1,4 +1,4 @@
-"""Meshes and accumulated clouds as binary PLY, in double precision: a kilometre away costs no micrometre."""
+"""Meshes and accumulated clouds as binary PLY, in double precision: a kilometer away costs no micrometer."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def _vertices(points: Float[np.ndarray, "n 3"], **properties: np.ndarray) -> Ply
 def write_points(
     path: Path, points: Float[np.ndarray, "n 3"], scan: Int[np.ndarray, " n"], name: str = "scan"
 ) -> None:
-    """Writes a cloud in metres; each point's integer goes into the vertex property `name`."""
+    """Writes a cloud in meters; each point's integer goes into the vertex property `name`."""
     PlyData([_vertices(points, **{name: np.asarray(scan, "<i4")})], byte_order="<").write(str(path))
 
 
@@ -36,7 +36,7 @@ def read_points(path: Path) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, "
 
 
 def write_mesh(path: Path, mesh: Mesh) -> None:
-    """Writes a triangle mesh in metres."""
+    """Writes a triangle mesh in meters."""
     faces = np.empty(len(mesh.faces), [("vertex_indices", "<i4", (3,))])
     faces["vertex_indices"] = mesh.faces
     PlyData([_vertices(mesh.vertices), PlyElement.describe(faces, "face")], byte_order="<").write(str(path))

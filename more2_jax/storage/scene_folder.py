@@ -364,7 +364,7 @@ def _object(
 
 
 def _color(content: dict[str, Any] | None) -> Color | None:
-    """The colour of an object; None where the file names none."""
+    """The color of an object; None where the file names none."""
     if content is None:
         return None
     return Color(points=content["points"], lab=np.array(content["lab"], np.float64))

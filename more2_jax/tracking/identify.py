@@ -113,7 +113,7 @@ def verified(
 
 
 def distances(objects: Sequence[SceneObject], centers: Float[np.ndarray, "m 3"]) -> Float[np.ndarray, "n m"]:
-    """Metres between where every object was last seen and the instances' `centers`, in the scene's frame."""
+    """Meters between where every object was last seen and the instances' `centers`, in the scene's frame."""
     here = np.stack([last_center(o) for o in objects])
     return np.linalg.norm(here[:, None] - centers[None], axis=-1)
 

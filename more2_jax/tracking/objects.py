@@ -90,7 +90,7 @@ def place_of(seen: Observation) -> Pose:
 
 
 def motion_between(o: SceneObject, before: Observation, after: Observation) -> tuple[float, float]:
-    """How far (metres, at the object's mean) and by what angle (degrees) it moved, in the scene's frame."""
+    """How far (meters, at the object's mean) and by what angle (degrees) it moved, in the scene's frame."""
     first, then = place_of(before), place_of(after)
     center = accumulated_points(o).mean(axis=0, keepdims=True)
     distance = float(np.linalg.norm(apply_pose(then, center) - apply_pose(first, center)))

@@ -32,7 +32,7 @@ class Votes:
     """Where pairs of an object and an instance would put the scan if the object had not moved, each in some ways."""
 
     T_scene_scan: Float[np.ndarray, "p h 4 4"]
-    center: Float[np.ndarray, "p 3"]  # of the instance's points, in the scan's frame, metres
+    center: Float[np.ndarray, "p 3"]  # of the instance's points, in the scan's frame, meters
     object: Int[np.ndarray, " p"]
     instance: Int[np.ndarray, " p"]
 
@@ -55,7 +55,7 @@ def turns_deg(R: Float[np.ndarray, "*b 3 3"], other: Float[np.ndarray, "3 3"]) -
 
 
 def nearest_way(T: Pose, votes: Votes) -> tuple[Float[np.ndarray, " p"], Pose, Bool[np.ndarray, " p"]]:
-    """Of every pair, how far a frame is off (metres, at the mean), the nearest of its ways, and whether turns agree."""
+    """Of every pair, how far a frame is off (meters, at the mean), the nearest of its ways, and whether turns agree."""
     there = np.einsum("phij,pj->phi", votes.T_scene_scan[..., :3, :3], votes.center)
     there += votes.T_scene_scan[..., :3, 3]
     gap = np.linalg.norm(there - apply_pose(T, votes.center)[:, None], axis=-1)
@@ -152,7 +152,7 @@ def with_errors(T: Pose, votes: Votes, upright: bool) -> Estimate:
 
 
 def position_sigma(e: Estimate, points: Points) -> float:
-    """Standard error of what a frame makes of the worst of some places (scene's frame), metres."""
+    """Standard error of what a frame makes of the worst of some places (scene's frame), meters."""
     J = [np.hstack([np.eye(3), -np.cross(np.eye(3), p - e.middle)]) for p in points]
     return float(np.sqrt(max(np.trace(j @ e.covariance @ j.T) for j in J)))
 

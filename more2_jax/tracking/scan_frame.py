@@ -1,7 +1,7 @@
 """How a scan's frame lies in the scene's: a common height first, then the motion that most of what stayed agrees on.
 
 Beyond the paper (preset `robust`). The scene's frame is that of its first scan. Heights, "it did not move" and the
-metres that a thing moved mean nothing until scans are in one frame.
+meters that a thing moved mean nothing until scans are in one frame.
 """
 
 from __future__ import annotations

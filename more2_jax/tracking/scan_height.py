@@ -31,7 +31,7 @@ LEAST_M = 0.005  # a smaller lift is none
 
 @dataclass(frozen=True, kw_only=True)
 class Rooms:
-    """What is not an instance, of the scene so far (scene's frame) and of the new scan (its own), metres."""
+    """What is not an instance, of the scene so far (scene's frame) and of the new scan (its own), meters."""
 
     scene: Points = field(default_factory=lambda: np.zeros((0, 3)))
     scan: Points = field(default_factory=lambda: np.zeros((0, 3)))
@@ -44,7 +44,7 @@ def common_height(
     config: SceneConfig,
     rooms: Rooms,
 ) -> tuple[float, PairFits]:
-    """What to add to a scan's heights, metres, and how pairs then fit: the lift that explains the scans best.
+    """What to add to a scan's heights, meters, and how pairs then fit: the lift that explains the scans best.
 
     Nothing, unless most tops and bottoms of likely pairs agree on something else, and pairs fit clearly better.
     """
@@ -91,7 +91,7 @@ def explained(fits: PairFits) -> float:
 def height_votes(
     old: Sequence[ObservedObject], new: Sequence[ObservedObject], config: SceneConfig
 ) -> tuple[Float[np.ndarray, " v"], Float[np.ndarray, " v"]]:
-    """Differences of the bottoms and of the tops of likely pairs, metres, and their weights."""
+    """Differences of the bottoms and of the tops of likely pairs, meters, and their weights."""
     proposal = proposal_of(compared(old, new), config)
     ranks = [np.argsort(np.argsort(-proposal, axis=a), axis=a) for a in (0, 1)]
     weight = sum(0.5**r for r in ranks)

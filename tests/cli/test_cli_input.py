@@ -82,7 +82,7 @@ def test_run_names_skipped_objects_and_records_them(tmp_path, tiny, capsys):
 
 
 @pytest.mark.parametrize(("unit", "warned"), [("m", True), ("mm", False)])
-def test_millimetres_are_warned_of_and_scaled(tmp_path, tiny, capsys, unit, warned):
+def test_millimeters_are_warned_of_and_scaled(tmp_path, tiny, capsys, unit, warned):
     points, ids = boxes()
     a = scan_file(tmp_path / "a.ply", 1000 * points, ids)
     assert run_quickly(a, out=tmp_path / "room", prior=tiny, unit=unit) == 0

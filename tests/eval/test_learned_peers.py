@@ -20,7 +20,7 @@ from more2_jax.types import Embedding
 SMALL = """
 model:
   encoder:
-    {widths: [4, 4, 8, 8, 8, 8, 8], code: 6, neighbours: 4, head_channels: 4, downsample_factors: [2, 2, 2], points: 64}
+    {widths: [4, 4, 8, 8, 8, 8, 8], code: 6, neighbors: 4, head_channels: 4, downsample_factors: [2, 2, 2], points: 64}
   decoder: {hidden: 16, layers: 3, skip_layer: 1, dropout: 0.0, narrow_skip: false}
 training: {batch: 4, queries: 16, raw_points: 64, max_views: 2, warmup_steps: 1}
 """

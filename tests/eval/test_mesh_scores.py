@@ -54,7 +54,7 @@ def test_the_true_mesh_is_right_wherever_it_stands():
 
 @pytest.mark.parametrize("off", [0.001, 0.02])
 def test_a_distance_is_to_the_surface_however_few_its_samples_are(off):
-    """Samples of 3,000 points lie 0.015 apart: a box that is wider by a millimetre is told from the true one."""
+    """Samples of 3,000 points lie 0.015 apart: a box that is wider by a millimeter is told from the true one."""
     wider = trimesh.creation.box(np.array([1.0, 0.6, 0.4]) + 2 * off)
     found = mesh_scores(mesh_of(wider), TRUTH, np.eye(4), SAMPLES)
     assert found["completeness_m"] == pytest.approx(off, rel=1e-6)
@@ -204,9 +204,9 @@ def test_an_object_without_a_mask_has_failed_but_not_as_published():
     assert [r["mr.published"] for r in found if "mr.published" in r] == [1.0] * 7
 
 
-def test_a_preset_is_measured_with_and_without_joint_optimisation():
+def test_a_preset_is_measured_with_and_without_joint_optimization():
     paper, robust = preset("paper"), preset("robust")
-    assert own_names("paper", paper) == ("ours, paper", "ours, paper, without optimisation")
-    assert own_names("robust", robust) == ("ours, robust", "ours, robust, with joint optimisation")
+    assert own_names("paper", paper) == ("ours, paper", "ours, paper, without optimization")
+    assert own_names("robust", robust) == ("ours, robust", "ours, robust, with joint optimization")
     assert with_joint(paper) == paper
     assert with_joint(robust).joint == dataclasses.replace(robust.joint, steps=JOINT_STEPS)

@@ -163,12 +163,12 @@ def test_all_programs_on_one_scene(tmp_path, tiny_prior):
     pytest.importorskip("open3d")
     from pieces import furniture
 
-    from train import synthesise
+    from train import synthesize
     from train.furniture.collections import write_packed
 
     write_packed(tmp_path / "f.npz", list(furniture()))
-    synthesise.main(
-        synthesise.Settings(source=tmp_path / "f.npz", regime="sparse", out=tmp_path / "d", scenes=1, scans=2)
+    synthesize.main(
+        synthesize.Settings(source=tmp_path / "f.npz", regime="sparse", out=tmp_path / "d", scenes=1, scans=2)
     )
     save_prior(tiny_prior, tmp_path / "tiny.npz")
     everything.main(

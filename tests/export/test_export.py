@@ -63,7 +63,7 @@ def test_glb_turns_the_short_way_between_scans(tmp_path):
 
 @pytest.mark.parametrize("scan", [0, 1, 2])
 def test_glb_rests_in_the_scan_asked_for_with_y_up(tmp_path, scan):
-    """trimesh reads nodes at rest, not animations; a kilometre from the world's zero."""
+    """trimesh reads nodes at rest, not animations; a kilometer from the world's zero."""
     graph = trimesh.load_scene(export_scene(SCENE, tmp_path / "room.glb", "glb", scan=scan))
     assert set(graph.graph.nodes_geometry) == {o.id for o in SCENE.objects}
     for o in SCENE.objects:

@@ -14,7 +14,7 @@ from more2_jax.types import Mesh, Observation, SceneObject
 
 
 def rigid(seed: int) -> np.ndarray:
-    """A turn about all axes and a shift of metres, 50 m from zero."""
+    """A turn about all axes and a shift of meters, 50 m from zero."""
     T = np.eye(4)
     T[:3, :3] = Rotation.random(random_state=seed).as_matrix()
     T[:3, 3] = 50 + np.random.default_rng(seed).uniform(-3, 3, 3)
@@ -61,11 +61,11 @@ OBJECTS = [
 ]
 ROOM = dataclasses.replace(living_scene(), objects=tuple(o for o, _ in OBJECTS), changes=())
 OBSERVED = {o.id: observed for o, observed in OBJECTS}
-LARGEST_M = 1e-4  # files hold single precision, a few metres about the nodes
+LARGEST_M = 1e-4  # files hold single precision, a few meters about the nodes
 
 
 def off_surface(vertices, faces, points) -> float:
-    """Largest distance of points from a mesh, metres; from the vertices where there are no faces."""
+    """Largest distance of points from a mesh, meters; from the vertices where there are no faces."""
     if faces is None:
         return np.linalg.norm(points[:, None] - vertices[None], axis=-1).min(axis=1).max()
     return np.abs(trimesh.proximity.signed_distance(trimesh.Trimesh(vertices, faces), points)).max()

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from more2_jax.geometry.outliers import NEIGHBOURS, inliers, outlier_factors
+from more2_jax.geometry.outliers import NEIGHBORS, inliers, outlier_factors
 
 
 def sheet(count=2000, seed=0):
@@ -29,7 +29,7 @@ def test_a_sparse_part_is_none():
 def test_by_definition():
     points = np.random.default_rng(2).normal(size=(60, 3))
     distance = np.linalg.norm(points[:, None] - points, axis=2)
-    near = np.argsort(distance, axis=1)[:, 1 : NEIGHBOURS + 1]
+    near = np.argsort(distance, axis=1)[:, 1 : NEIGHBORS + 1]
     own = np.take_along_axis(distance, near, axis=1).mean(axis=1)
     np.testing.assert_allclose(outlier_factors(points), own / own[near].mean(axis=1))
 

@@ -40,7 +40,7 @@ def test_points_come_back_unharmed():
         np.testing.assert_allclose(unpadded(batch, row), np.sort(points, axis=0), atol=1e-6)
 
 
-def test_a_kilometre_away_nothing_is_lost():
+def test_a_kilometer_away_nothing_is_lost():
     near, far = cloud(500) * 0.1, np.array([1000.0, -2000.0, 5.0])
     batch = pad_clouds([near, near + far])
     assert batch.origin.dtype == np.float64

@@ -1,4 +1,4 @@
-"""Farthest points, nearest neighbours, Kabsch and chamfer against NumPy and SciPy, also where they are ill-posed."""
+"""Farthest points, nearest neighbors, Kabsch and chamfer against NumPy and SciPy, also where they are ill-posed."""
 
 import jax
 import jax.numpy as jnp

@@ -244,7 +244,7 @@ def test_a_bonus_of_another_shape_is_refused(unchecked):
         match_instances(codes(0, 2), codes(1, 3), MatchingConfig(), bonus=np.zeros((2, 2), np.float32))
 
 
-def test_an_object_a_kilometre_away_matches_as_well():
+def test_an_object_a_kilometer_away_matches_as_well():
     source, target = codes(9, 5), codes(10, 7)
     far = dataclasses.replace(target, origin=target.origin + 1000.0)
     plain, moved = (match_instances(source, t, MatchingConfig()) for t in (target, far))

@@ -1,4 +1,4 @@
-"""Colour tells identical copies apart where both scans have it, and changes nothing where one has none."""
+"""Color tells identical copies apart where both scans have it, and changes nothing where one has none."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from more2_jax.tracking.identify import last_seen, match_scan
 from more2_jax.tracking.objects import new_object, seen_again
 from more2_jax.types import Color, Instance, Scan
 
-RED, BLUE, GREY = (190, 60, 50), (60, 80, 170), (128, 128, 128)
+RED, BLUE, GRAY = (190, 60, 50), (60, 80, 170), (128, 128, 128)
 HERE, THERE = 0.0, 3.0
 ROBUST = preset("robust", upright=True)
 CONFIG = dataclasses.replace(
@@ -31,7 +31,7 @@ CONFIG = dataclasses.replace(
 
 
 def shape() -> np.ndarray:
-    """A box with a fin on it; metres."""
+    """A box with a fin on it; meters."""
     rng = np.random.default_rng(0)
     box = rng.uniform(-0.5, 0.5, (500, 3))
     box[np.arange(500), rng.integers(0, 3, 500)] = rng.choice([-0.5, 0.5], 500)
@@ -40,13 +40,13 @@ def shape() -> np.ndarray:
 
 
 def painted(rgb: tuple[int, int, int] | None, seed: int = 0, count: int = 640) -> np.ndarray | None:
-    """Colours about one, as a camera sees them."""
+    """Colors about one, as a camera sees them."""
     noise = np.random.default_rng(seed).normal(0, 8, (count, 3))
     return None if rgb is None else np.clip(rgb + noise, 0, 255).astype(np.uint8)
 
 
 def twins(paints, at=(HERE, THERE), brightness: float = 1.0) -> Scan:
-    """Copies of one shape, a colour and a place along x each; ids are 1, 2, ..."""
+    """Copies of one shape, a color and a place along x each; ids are 1, 2, ..."""
     instances = []
     for k, (paint, x) in enumerate(zip(paints, at, strict=True)):
         rgb = painted(paint, k)
@@ -67,7 +67,7 @@ def partners(result) -> list[tuple[int, int, bool]]:
 
 
 @pytest.mark.parametrize("brightness", [1.0, 0.8])
-def test_copies_that_swap_places_are_told_by_their_colour(tiny_prior, brightness):
+def test_copies_that_swap_places_are_told_by_their_color(tiny_prior, brightness):
     swapped = twins((BLUE, RED), brightness=brightness)
     assert partners(identified(tiny_prior, twins((RED, BLUE)), swapped)) == [(0, 1, False), (1, 0, False)]
     without = identified(tiny_prior, twins((None, None)), swapped)
@@ -87,7 +87,7 @@ def test_a_swap_is_told_as_two_motions_also_to_a_scene_that_was_saved(tiny_prior
     assert added.changes[0].moved == ("object_000", "object_001") and not added.changes[0].static
     assert not any(o.observations[1].interchangeable for o in added.objects)
     for o in content["objects"]:
-        del o["color"]  # as written before colours were
+        del o["color"]  # as written before colors were
     (tmp_path / "scene/scene.json").write_text(json.dumps(content))
     old, _ = load_scene(tmp_path / "scene")
     assert [o.color for o in old.objects] == [None, None]
@@ -96,20 +96,20 @@ def test_a_swap_is_told_as_two_motions_also_to_a_scene_that_was_saved(tiny_prior
     assert all(o.color is not None for o in added.objects)  # of the new scan alone
 
 
-@pytest.mark.parametrize("paint", [RED, GREY])
-def test_copies_of_one_colour_stay_as_interchangeable_as_without(tiny_prior, paint):
+@pytest.mark.parametrize("paint", [RED, GRAY])
+def test_copies_of_one_color_stay_as_interchangeable_as_without(tiny_prior, paint):
     found = identified(tiny_prior, twins((paint, paint)), twins((paint, paint)))
     assert partners(found) == [(0, 0, True), (1, 1, True)]
 
 
-def test_colour_in_one_scan_alone_changes_no_bit(tiny_prior):
-    plain, coloured = twins((None, None)), twins((RED, BLUE))
-    results = [identified(tiny_prior, *s) for s in ((plain, plain), (plain, coloured), (coloured, plain))]
+def test_color_in_one_scan_alone_changes_no_bit(tiny_prior):
+    plain, colored = twins((None, None)), twins((RED, BLUE))
+    results = [identified(tiny_prior, *s) for s in ((plain, plain), (plain, colored), (colored, plain))]
     assert results[0].found == results[1].found == results[2].found
     assert results[0].gone == results[1].gone and results[0].new == results[2].new
 
 
-def test_an_object_gains_the_colours_of_accumulated_observations(tiny_prior):
+def test_an_object_gains_the_colors_of_accumulated_observations(tiny_prior):
     first, second = twins((RED, RED)).instances
     o = new_object(0, 0, first, embed(tiny_prior, [first.points])[0])
     again = dataclasses.replace(o.observations[0], scan=1)
@@ -124,7 +124,7 @@ def test_an_object_gains_the_colours_of_accumulated_observations(tiny_prior):
     assert seen_again(o, dataclasses.replace(second, colors=None), again).color.points == 640
 
 
-def test_both_names_of_an_npzs_colours_and_those_of_a_ply_reach_the_instance(tmp_path):
+def test_both_names_of_an_npzs_colors_and_those_of_a_ply_reach_the_instance(tmp_path):
     arrays = {"points": shape(), "instance": np.ones(640, np.int32)}
     for name in ("color", "colors"):
         np.savez(tmp_path / f"{name}.npz", **arrays, **{name: painted(RED)})
@@ -134,8 +134,8 @@ def test_both_names_of_an_npzs_colours_and_those_of_a_ply_reach_the_instance(tmp
 # --- the record and its likelihood --------------------------------------------------------------------------
 
 
-def test_the_colour_of_a_union_is_the_pooled_colours():
-    clouds = [painted(p, k, n) for k, (p, n) in enumerate([(RED, 1), (BLUE, 300), (GREY, 77)])]
+def test_the_color_of_a_union_is_the_pooled_colors():
+    clouds = [painted(p, k, n) for k, (p, n) in enumerate([(RED, 1), (BLUE, 300), (GRAY, 77)])]
     whole = color_of(np.concatenate(clouds))
     parts = [color_of(c) for c in clouds]
     for order in (parts, parts[::-1], [pooled(*parts[:2]), None, parts[2]]):
@@ -145,7 +145,7 @@ def test_the_colour_of_a_union_is_the_pooled_colours():
     assert pooled() is pooled(None, None) is color_of(None) is color_of(np.zeros((0, 3), np.uint8)) is None
 
 
-def test_points_in_another_order_are_of_the_same_colour():
+def test_points_in_another_order_are_of_the_same_color():
     rgb = painted(RED)
     shuffled = np.random.default_rng(1).permutation(rgb)
     np.testing.assert_allclose(color_of(rgb).lab, color_of(shuffled).lab, rtol=1e-12)
@@ -156,7 +156,7 @@ def test_points_in_another_order_are_of_the_same_colour():
     [((255, 255, 255), (100, 0, 0)), ((0, 0, 0), (0, 0, 0)), ((255, 0, 0), (53.24, 80.09, 67.2))],
 )
 @pytest.mark.parametrize("dtype", [np.uint8, np.int64])
-def test_one_point_has_its_own_colour(rgb, lab, dtype):
+def test_one_point_has_its_own_color(rgb, lab, dtype):
     color = color_of(np.array([rgb], dtype))
     assert color.points == 1
     np.testing.assert_allclose(color.lab, lab, atol=0.02)
@@ -182,20 +182,20 @@ def test_evidence_is_the_ratio_of_the_densities_it_names():
     from scipy.stats import norm
 
     old, new = lab((20, 40, 10), (80, -60, -50)), lab((30, 35, 20), (90, -10, 60))
-    for n, m in np.ndindex(2, 2):  # rooms of many colours: the spread is `DIFFERENT`
+    for n, m in np.ndindex(2, 2):  # rooms of many colors: the spread is `DIFFERENT`
         d = old[n].lab - new[m].lab
         same, different = norm.pdf(d, scale=SAME).prod(), norm.pdf(d, scale=DIFFERENT).prod()
         expected = np.log(((1 - ODD) * same + ODD * different) / different)
         assert color_evidence(old, new)[n, m] == pytest.approx(expected)
 
 
-def test_a_room_or_a_file_of_one_colour_says_nothing():
+def test_a_room_or_a_file_of_one_color_says_nothing():
     many, one = lab((20, 40, 10), (80, -60, -50), (50, 0, 0)), lab(*[(100, 0, 0)] * 4)
     for old, new in ((one, one), (many, one), (one, many)):
         np.testing.assert_allclose(color_evidence(old, new), 0.0, atol=1e-12)
 
 
-def test_objects_without_colour_neither_have_evidence_nor_take_it_from_others():
+def test_objects_without_color_neither_have_evidence_nor_take_it_from_others():
     old, new = lab((20, 40, 10), None, (80, -60, -50)), lab(None, (30, 35, 20), (90, -10, 60))
     ratio = color_evidence(old, new)
     assert not ratio[1].any() and not ratio[:, 0].any()

@@ -16,10 +16,10 @@ from more2_jax.meshing.grid import cube
 from more2_jax.network.embedding_batch import embed
 from more2_jax.types import Embedding
 
-SCALE = 2.0  # metres per canonical unit
+SCALE = 2.0  # meters per canonical unit
 CENTER, ORIGIN = np.array([0.1, -0.2, 0.05]), np.array([1000.0, -2000.0, 5.0])
 CONFIG = MeshingConfig(coarse=16, resolution=64)
-STEP = SCALE * 2 * CONFIG.half_width / CONFIG.resolution  # metres
+STEP = SCALE * 2 * CONFIG.half_width / CONFIG.resolution  # meters
 PIECE = Embedding(
     inv=np.zeros(4, np.float32),
     eqv=np.zeros((3, 4), np.float32),
@@ -170,7 +170,7 @@ def test_the_decoder_itself_gives_a_closed_mesh_or_none(tiny_prior):
     assert extract_mesh(tiny_prior, code, config, level=float(values.min()) - 10.0) is None
 
 
-@pytest.mark.parametrize("height", [-0.5, -0.1, 0.2])  # canonical, from the ball's centre
+@pytest.mark.parametrize("height", [-0.5, -0.1, 0.2])  # canonical, from the ball's center
 def test_nothing_lies_below_the_floor(field_is, tiny_prior, height):
     field_is(ball)
     floor = float(CENTER[2] + ORIGIN[2] + SCALE * height)

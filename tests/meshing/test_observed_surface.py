@@ -208,11 +208,11 @@ def test_exact_points_beside_an_edge_face_as_their_side_does():
     found = seen_surface(points, points * [1, 1, 0], REACH)
     assert found.exact and (found.center == points).all()
     faces = np.einsum("ni,ni->n", found.normal, outward)
-    plain = planes_of(points, found.neighbours).normal
+    plain = planes_of(points, found.neighbors).normal
     assert np.mean(faces > 0.99) > 0.97 > 0.9 > np.mean(np.abs(np.einsum("ni,ni->n", plain, outward)) > 0.99)
 
 
-def test_along_scan_lines_neighbours_of_one_line_make_no_plane():
+def test_along_scan_lines_neighbors_of_one_line_make_no_plane():
     """Points four times as dense along lines as across: the six nearest are of one line, not the twelve nearest."""
     along, across = np.meshgrid(np.arange(-0.3, 0.3, 0.001), np.arange(-0.05, 0.05, 0.004))
     points = np.column_stack([along.ravel(), across.ravel(), np.zeros(along.size)])
@@ -223,14 +223,14 @@ def test_along_scan_lines_neighbours_of_one_line_make_no_plane():
     found = seen_surface(points, outward, REACH)
     assert found.exact
     faces = np.einsum("ni,ni->n", found.normal, outward)
-    nearest = np.abs(np.einsum("ni,ni->n", planes_of(points, found.neighbours[:, :6]).normal, outward))
+    nearest = np.abs(np.einsum("ni,ni->n", planes_of(points, found.neighbors[:, :6]).normal, outward))
     assert np.mean(faces > 0.99) > 0.9 > 0.7 > np.mean(nearest > 0.99)
 
 
 def test_of_noisy_points_planes_stay_means():
     points, _ = leg(noise=0.003)
     found = seen_surface(points, points * [1, 1, 0], REACH)
-    plain = planes_of(points, found.neighbours)
+    plain = planes_of(points, found.neighbors)
     assert not found.exact and (found.center == plain.center).all()
     np.testing.assert_allclose(np.abs(np.einsum("ni,ni->n", found.normal, plain.normal)), 1.0, rtol=1e-6)
 

@@ -1,4 +1,4 @@
-"""Planes of neighbouring points: as NumPy's eigenvectors have them, whatever the frame, the order and the padding."""
+"""Planes of neighboring points: as NumPy's eigenvectors have them, whatever the frame, the order and the padding."""
 
 import numpy as np
 import pytest
@@ -9,7 +9,7 @@ from more2_jax.geometry.padding import MIN_POINTS
 from more2_jax.meshing.planes import OF_FACE, WIDE, planes, planes_of
 
 
-def neighbours(points, count=12):
+def neighbors(points, count=12):
     return np.asarray(KDTree(points).query(points, k=count)[1])
 
 
@@ -31,7 +31,7 @@ def by_eigenvectors(points, near):
 
 
 def faces_one_by_one(points, near):
-    """The definition: of the planes of the six nearest of each neighbour, the one that all of these fit best."""
+    """The definition: of the planes of the six nearest of each neighbor, the one that all of these fit best."""
     center, normal, spread = by_eigenvectors(points, near[:, :OF_FACE])
     otherwise, found = by_eigenvectors(points, near)[1], []
     for k, row in enumerate(near):
@@ -48,7 +48,7 @@ def cosine(a, b):
 @pytest.mark.parametrize("noise", [0.002, 0.02])
 def test_planes_are_those_of_the_eigenvectors(noise):
     points, _ = edge(noise=noise)
-    near = neighbours(points)
+    near = neighbors(points)
     found, (center, normal, spread) = planes_of(points, near), by_eigenvectors(points, near)
     np.testing.assert_allclose(found.center, center, atol=1e-6)
     np.testing.assert_allclose(found.off, spread[:, 0], rtol=1e-3, atol=1e-9)
@@ -60,7 +60,7 @@ def test_planes_are_those_of_the_eigenvectors(noise):
 
 def test_beside_an_edge_a_face_is_one_of_the_two():
     points, across = edge()
-    found = planes_of(points, neighbours(points))
+    found = planes_of(points, neighbors(points))
     true = np.eye(3)[across]
     assert (
         (cosine(found.face, true) > 0.9999).mean()
@@ -71,18 +71,18 @@ def test_beside_an_edge_a_face_is_one_of_the_two():
 
 
 def test_points_of_a_line_lie_in_no_plane():
-    """Two scan lines, eight times as far apart as their points: six neighbours are of one line, twelve are not."""
+    """Two scan lines, eight times as far apart as their points: six neighbors are of one line, twelve are not."""
     along = np.arange(0, 0.4, 0.01)
     points = np.concatenate([np.column_stack([along, np.full(40, y), 0 * along]) for y in (0.0, 0.03)])
-    found = planes_of(points, neighbours(points))
+    found = planes_of(points, neighbors(points))
     np.testing.assert_allclose(cosine(found.face, np.tile([0.0, 0, 1], (80, 1)))[5:35], 1.0, atol=1e-5)
 
 
 def test_frame_order_and_padding_change_nothing():
     points, _ = edge(count=MIN_POINTS + 44, noise=0.003)
-    near, here = neighbours(points), planes_of(points, neighbours(points))
+    near, here = neighbors(points), planes_of(points, neighbors(points))
     R, order = Rotation.random(random_state=0).as_matrix(), np.random.default_rng(1).permutation(len(points))
-    turned, mixed = planes_of(points @ R.T, near), planes_of(points[order], neighbours(points[order]))
+    turned, mixed = planes_of(points @ R.T, near), planes_of(points[order], neighbors(points[order]))
     np.testing.assert_allclose(turned.center, here.center @ R.T, atol=1e-6)
     np.testing.assert_allclose(turned.spread, here.spread, rtol=1e-4)
     np.testing.assert_allclose(mixed.off, here.off[order], rtol=1e-3, atol=1e-9)
@@ -99,7 +99,7 @@ def test_frame_order_and_padding_change_nothing():
     ids=["one place", "three places", "a line"],
 )
 def test_points_without_a_plane_have_unit_normals_all_the_same(points):
-    found = planes_of(points, neighbours(points))
+    found = planes_of(points, neighbors(points))
     for normal in (found.normal, found.face):
         np.testing.assert_allclose(np.linalg.norm(normal, axis=1), 1.0, atol=1e-5)
     assert np.isfinite(found.center).all() and (found.off < 1e-6).all()
@@ -109,5 +109,5 @@ def test_clouds_of_many_sizes_share_a_program():
     before = planes._cache_size()
     for count in (600, 700, 1000):
         points, _ = edge(count=count)
-        planes_of(points, neighbours(points, 13))
+        planes_of(points, neighbors(points, 13))
     assert planes._cache_size() == before + 1

@@ -97,7 +97,7 @@ def test_distance_turns_scales_and_shifts_with_the_code(prior):
     np.testing.assert_allclose(ours, sdf_one(prior, code, jnp.asarray(points)), atol=2e-5)
 
 
-def test_gradient_is_finite_at_the_centre(prior):
+def test_gradient_is_finite_at_the_center(prior):
     code = random_code(prior.config.encoder.code)
 
     def total(points: jax.Array, code: Embedding) -> jax.Array:
@@ -117,7 +117,7 @@ def test_distance_is_finite_far_away(prior):
 def test_dropout_only_while_training():
     config = PriorConfig(
         encoder=EncoderConfig(
-            widths=(16,) * 7, code=16, neighbours=4, downsample_factors=(2, 2, 2), points=64
+            widths=(16,) * 7, code=16, neighbors=4, downsample_factors=(2, 2, 2), points=64
         ),
         decoder=DecoderConfig(hidden=64, layers=4, skip_layer=2, dropout=0.5),
     )
@@ -137,7 +137,7 @@ def test_dropout_only_while_training():
 
 
 def test_sdf_takes_points_of_the_scan_far_from_zero(tiny_prior):
-    """Batched, with float64 origins: a kilometre away gives the same distances."""
+    """Batched, with float64 origins: a kilometer away gives the same distances."""
     code = random_code(16)
     origin = np.array([[1000.0, -2000.0, 30.0]])
     batch = jax.tree.map(lambda x: jnp.asarray(x)[None], code)

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from more2_jax.config import EncoderConfig, PriorConfig, TrainingRun, load_config
 from more2_jax.geometry.padding import pad_clouds
-from more2_jax.network.encoder import neighbour_counts, power_of_two
+from more2_jax.network.encoder import neighbor_counts, power_of_two
 from more2_jax.network.prior import Prior, encode, encode_one, init_prior
 from more2_jax.types import Embedding, PointCloud
 
@@ -134,7 +134,7 @@ DEGENERATE = {
     "collinear": np.outer(LINE, [1.0, 2.0, 3.0]),
     "planar": np.random.default_rng(1).uniform(size=(100, 3)) * [1, 1, 0],
     "regular grid": np.stack(np.meshgrid(*[np.arange(5.0)] * 3), axis=-1).reshape(-1, 3),
-    "a micrometre": 1e-6 * furniture(0),
+    "a micrometer": 1e-6 * furniture(0),
 }
 
 
@@ -155,7 +155,7 @@ def test_degenerate_clouds_have_finite_codes_and_gradients(prior):
 
 
 def test_gradient_agrees_with_finite_differences(tiny_prior):
-    """In float64, where no neighbour changes within the step."""
+    """In float64, where no neighbor changes within the step."""
     with jax.enable_x64(True):
         prior = jax.tree.map(lambda x: x.astype(jnp.float64), tiny_prior)
         points, mask = furniture(4, count=100), np.ones(100, bool)
@@ -183,10 +183,10 @@ def test_encode_refuses_clouds_without_points(tiny_prior):
         encode(tiny_prior, empty)
 
 
-def test_init_refuses_an_input_too_small_for_its_neighbours():
+def test_init_refuses_an_input_too_small_for_its_neighbors():
     config = PriorConfig(encoder=EncoderConfig(points=256))
-    assert neighbour_counts(config.encoder, 512)[-1] == 16
-    with pytest.raises(ValueError, match="needed 16 neighbours"):
+    assert neighbor_counts(config.encoder, 512)[-1] == 16
+    with pytest.raises(ValueError, match="needed 16 neighbors"):
         init_prior(config, jax.random.key(0))
 
 

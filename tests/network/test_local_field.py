@@ -83,7 +83,7 @@ def one_by_one(params, anchors: Anchors, scale: float, q: np.ndarray) -> np.ndar
     return np.array(rows)
 
 
-def test_blend_is_the_normalised_sum_over_anchors(lookup):
+def test_blend_is_the_normalized_sum_over_anchors(lookup):
     params, ask = lookup
     q = np.random.default_rng(0).uniform(-0.6, 0.6, (20, 3))
     anchors = random_anchors(30)

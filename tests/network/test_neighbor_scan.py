@@ -1,11 +1,11 @@
-"""Sums and maps over neighbours: the same numbers and gradients as with all edges written out."""
+"""Sums and maps over neighbors: the same numbers and gradients as with all edges written out."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from more2_jax.network.neighbor_scan import over_neighbours
+from more2_jax.network.neighbor_scan import over_neighbors
 
 
 @pytest.fixture
@@ -14,8 +14,8 @@ def x64():
         yield
 
 
-def edge(neighbour: dict, own: jax.Array, shared: jax.Array, each: jax.Array):
-    product = jnp.sin(neighbour["a"] + own) * (neighbour["b"] @ shared) * each[:, None]
+def edge(neighbor: dict, own: jax.Array, shared: jax.Array, each: jax.Array):
+    product = jnp.sin(neighbor["a"] + own) * (neighbor["b"] @ shared) * each[:, None]
     return product, (product**2).sum(axis=-1)
 
 
@@ -45,7 +45,7 @@ def test_values_and_gradients(repeated: bool, jit: bool, x64: None):
         return jnp.sum(total * jnp.arange(4.0)) + jnp.sum(jnp.cos(kept))
 
     def by_scan(*given):
-        return over_neighbours(edge, *given)
+        return over_neighbors(edge, *given)
 
     def both(function):
         run = jax.value_and_grad(lambda *given: loss(function, *given), argnums=(0, 1, 2, 3))
@@ -60,7 +60,7 @@ def test_under_vmap_and_with_an_empty_half(x64: None):
     batch = jax.tree.map(lambda *x: jnp.stack(x), *examples)
 
     def total_only(source, own, shared, each, index):
-        return over_neighbours(lambda *given: (edge(*given)[0], ()), source, own, shared, each, index)
+        return over_neighbors(lambda *given: (edge(*given)[0], ()), source, own, shared, each, index)
 
     total, kept = jax.vmap(total_only)(*batch)
     assert kept == ()
@@ -72,7 +72,7 @@ def test_second_derivatives_exist(x64: None):
     *arguments, index = example(1, False)
 
     def slope(own):
-        return jax.grad(lambda o: over_neighbours(edge, arguments[0], o, *arguments[2:], index)[0].sum())(own)
+        return jax.grad(lambda o: over_neighbors(edge, arguments[0], o, *arguments[2:], index)[0].sum())(own)
 
     numeric = (slope(arguments[1] + 1e-4) - slope(arguments[1] - 1e-4)) / 2e-4
     exact = jax.grad(lambda o: slope(o).sum())(arguments[1])

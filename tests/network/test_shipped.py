@@ -69,9 +69,9 @@ encode_double = jax.jit(encode_ordered)
 
 @pytest.mark.parametrize("name", PRIORS)
 def test_shipped_weights_are_equivariant_up_to_ties_in_single_precision(name):
-    """The whole way from clouds kilometres apart, in float32: to 1e-4, but for clouds in which rounding decides.
+    """The whole way from clouds kilometers apart, in float32: to 1e-4, but for clouds in which rounding decides.
 
-    Where two points are equally far, to rounding, which of them is the last neighbour is open, and the codes differ
+    Where two points are equally far, to rounding, which of them is the last neighbor is open, and the codes differ
     by per cents. That happens to about one cloud in twenty; among these seven it may happen once.
     """
     prior, clouds = load_prior(name), demo_clouds()
@@ -84,7 +84,7 @@ def test_shipped_weights_are_equivariant_up_to_ties_in_single_precision(name):
         (after.inv, before.inv, np.abs(before.inv).max(axis=1)),
         (after.eqv, turn @ before.eqv, np.abs(before.eqv).max(axis=(1, 2))),
         (after.scale, scale * before.scale, scale * before.scale),
-        (world[1], expected, scale * before.scale),  # relative to the object's size, not to a kilometre
+        (world[1], expected, scale * before.scale),  # relative to the object's size, not to a kilometer
     )
     off = np.array([np.abs(a - b).reshape(len(clouds), -1).max(axis=1) / size for a, b, size in parts]).max(
         axis=0

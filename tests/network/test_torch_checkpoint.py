@@ -64,7 +64,7 @@ def state(
     return writer.write_raw(tmp_path / "a.pt", body, {"7": np.arange(stored, dtype="<f4").tobytes()})
 
 
-def test_strides_and_offsets_are_honoured(tmp_path):
+def test_strides_and_offsets_are_honored(tmp_path):
     whole = np.arange(12, dtype=np.float32)
     for offset, shape, strides, expected in (
         (0, (4, 3), (1, 4), whole.reshape(3, 4).T),

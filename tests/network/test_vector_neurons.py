@@ -1,4 +1,4 @@
-"""What the layers are made of: nearest neighbours by definition, gradients of products as plain ones."""
+"""What the layers are made of: nearest neighbors by definition, gradients of products as plain ones."""
 
 import jax
 import jax.numpy as jnp

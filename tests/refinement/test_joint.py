@@ -1,4 +1,4 @@
-"""Joint optimisation: never worse than its start, in the reference's frame, blind to padding."""
+"""Joint optimization: never worse than its start, in the reference's frame, blind to padding."""
 
 import dataclasses
 
@@ -174,6 +174,6 @@ def test_moving_the_code_is_encoding_what_was_moved(tiny_prior, factor):
     np.testing.assert_allclose(after.inv, expected.inv, atol=1e-4)
     np.testing.assert_allclose(after.eqv, expected.eqv, atol=1e-4)
     assert float(after.scale) == pytest.approx(float(expected.scale), rel=1e-4)
-    # Random weights put the centre far off; "relative" means to its length.
+    # Random weights put the center far off; "relative" means to its length.
     length = float(np.linalg.norm(expected.center))
     np.testing.assert_allclose(after.center + after.origin, expected.center, atol=1e-4 * length)

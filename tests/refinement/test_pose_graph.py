@@ -39,13 +39,13 @@ def sides(views, moves=None, size=POINTS, roughness=0.0):
     )
 
 
-def slips(rng, count, *, upright, metres=0.02, degrees=2.0):
+def slips(rng, count, *, upright, meters=0.02, degrees=2.0):
     """Small motions, the first none."""
     moves = np.tile(np.eye(4), (count, 1, 1))
     for T in moves[1:]:
         axis = np.array([0.0, 0.0, 1.0]) if upright else rng.normal(size=3)
         turn = np.deg2rad(degrees) * axis / np.linalg.norm(axis)
-        T[:3, :3], T[:3, 3] = Rotation.from_rotvec(turn).as_matrix(), rng.uniform(-metres, metres, 3)
+        T[:3, :3], T[:3, 3] = Rotation.from_rotvec(turn).as_matrix(), rng.uniform(-meters, meters, 3)
     return moves
 
 
@@ -155,7 +155,7 @@ def test_what_tells_little_stays_finite_and_near(kind):
     }[kind]
     found = np.asarray(close_poses(sides([(flat, up), view]), CONFIG, False))[0]
     assert np.isfinite(found).all()
-    # Points in one place slide to the nearest one: half the way between neighbours at most.
+    # Points in one place slide to the nearest one: half the way between neighbors at most.
     np.testing.assert_allclose(found[1], np.eye(4), atol=0.02 if kind == "one place" else 1e-3)
 
 

@@ -37,7 +37,7 @@ def prior():
 
 
 def slip(k: int) -> np.ndarray:
-    """A few millimetres and about a degree, none of the first."""
+    """A few millimeters and about a degree, none of the first."""
     return turn_z(np.deg2rad([0.0, 1.0, -1.0][k]), np.zeros(3), np.array([0.004, -0.003, 0.0]) * k)
 
 
@@ -78,7 +78,7 @@ def test_slips_shrink_to_a_fiftieth_and_records_agree(prior):
 
 def test_any_orientation_far_from_zero(prior):
     o, true = seen_with_slips(prior)
-    far = np.array([4e5, 5e6, 100.0])  # metres, as of a map's grid
+    far = np.array([4e5, 5e6, 100.0])  # meters, as of a map's grid
     turn = Rotation.from_rotvec([0.4, 1.0, -0.3]).as_matrix()
     there, back = np.eye(4), np.eye(4)
     there[:3, :3], there[:3, 3] = turn, far

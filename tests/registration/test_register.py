@@ -67,8 +67,8 @@ def furniture():
 
 def assert_recovered(found, poses, clouds):
     for got, T, cloud in zip(found, poses, clouds, strict=False):
-        degrees, metres = pieces.pose_error(got, T, cloud)
-        assert degrees < 0.5 and metres < 0.005 * pieces.size(cloud)
+        degrees, meters = pieces.pose_error(got, T, cloud)
+        assert degrees < 0.5 and meters < 0.005 * pieces.size(cloud)
 
 
 # --- the law ----------------------------------------------------------------------------------------------------
@@ -86,8 +86,8 @@ def test_registering_x_to_tx_recovers_t_and_the_way_back_its_inverse(tiny_prior,
     assert_recovered(there, poses, clouds)
     assert bool(record.converged.all())
     for T_ab, T_ba, cloud in zip(there, back, clouds, strict=False):
-        degrees, metres = pieces.pose_error(T_ab @ T_ba, np.eye(4), cloud)
-        assert degrees < 0.5 and metres < 0.005 * pieces.size(cloud)
+        degrees, meters = pieces.pose_error(T_ab @ T_ba, np.eye(4), cloud)
+        assert degrees < 0.5 and meters < 0.005 * pieces.size(cloud)
 
 
 def test_next_to_nothing_half_a_turn_and_any_unit(tiny_prior):
@@ -105,7 +105,7 @@ def test_next_to_nothing_half_a_turn_and_any_unit(tiny_prior):
     assert_recovered(found, poses, clouds)
 
 
-def test_kilometres_from_zero_cost_no_precision(tiny_prior):
+def test_kilometers_from_zero_cost_no_precision(tiny_prior):
     clouds, far = furniture(), np.array([1000.0, -2000.0, 5.0])
     rng = np.random.default_rng(3)
     poses = [pieces.random_pose(rng, upright=False) for _ in clouds]

@@ -29,7 +29,7 @@ pytestmark = in_a_browser
 
 
 def test_it_opens_from_disk_and_draws_every_object(opened):
-    """No word on the console, no request (the fixture's), and the last scan's objects in their colours."""
+    """No word on the console, no request (the fixture's), and the last scan's objects in their colors."""
     page = opened()
     assert state(page, "error") is None
     assert (state(page, "time"), state(page, "scans")) == (2, 3)

@@ -52,7 +52,7 @@ NAMELESS = """() => [...document.querySelectorAll("button, input, select, a, sum
     return !(label || own || heading || (e.labels && [...e.labels].some((l) => l.textContent.trim())));
   }).map((e) => e.outerHTML.slice(0, 120))"""
 
-# WCAG 2.2, 1.4.3: contrast of every text with what lies under it, colours that let light through laid over each other.
+# WCAG 2.2, 1.4.3: contrast of every text with what lies under it, colors that let light through laid over each other.
 FAINT = """() => {
   const parse = (c) => { const v = c.match(/[\\d.]+/g).map(Number); return v.length === 3 ? [...v, 1] : v; };
   const over = (a, b) => [0, 1, 2].map((k) => a[k] * a[3] + b[k] * (1 - a[3])).concat(1);

@@ -217,7 +217,7 @@ def test_points_come_back_to_half_a_step():
 
 
 def test_the_page_puts_every_observation_where_the_scan_saw_it():
-    """Poses and quantised clouds of the payload, composed as three.js does, give the scans' points back."""
+    """Poses and quantized clouds of the payload, composed as three.js does, give the scans' points back."""
     data, text = payload(SCENE, CONFIG)
     blob = unpacked(text)
     clouds = [points_of(o, s) for o in SCENE.objects for s in o.observations]
@@ -294,7 +294,7 @@ def test_coverage_of_a_cube_is_the_share_of_sides_seen():
     assert coverage(mesh, top[:1] + 5) == 0.0
 
 
-# --- colours ------------------------------------------------------------------------------------------------
+# --- colors ------------------------------------------------------------------------------------------------
 
 # Machado, Oliveira & Fernandes 2009, severity 1, on linear RGB.
 SEEN_BY = {
@@ -327,14 +327,14 @@ def companded(c: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("eyes", sorted(SEEN_BY))
-def test_the_first_colours_differ_for_all_eyes(eyes):
+def test_the_first_colors_differ_for_all_eyes(eyes):
     base = np.array([rgb(k) for k in range(len(BASE))]) / 255
     lab = rgb2lab(companded(linear(base) @ np.array(SEEN_BY[eyes]).T))
     distance = np.linalg.norm(lab[:, None] - lab[None], axis=-1)
     assert distance[~np.eye(len(base), dtype=bool)].min() > 20  # CIE76; 2.3 is just noticeable
 
 
-def test_the_first_colours_stand_out_from_both_grounds():
+def test_the_first_colors_stand_out_from_both_grounds():
     luminance = np.array(
         [linear(np.array(rgb(k)) / 255) @ [0.2126, 0.7152, 0.0722] for k in range(len(BASE))]
     )
@@ -342,12 +342,12 @@ def test_the_first_colours_stand_out_from_both_grounds():
     assert ((luminance + 0.05) / 0.058).min() >= 1.9
 
 
-def test_fifty_colours_differ():
+def test_fifty_colors_differ():
     assert len({color(k) for k in range(50)}) == 50
 
 
 @pytest.mark.parametrize("number", range(50))
-def test_numbers_are_readable_on_their_colour(number):
+def test_numbers_are_readable_on_their_color(number):
     luminance = float(linear(np.array(rgb(number)) / 255) @ [0.2126, 0.7152, 0.0722])
     other = 0.0 if ink(number) == "#000" else 1.0
     assert (max(luminance, other) + 0.05) / (min(luminance, other) + 0.05) >= 4.5

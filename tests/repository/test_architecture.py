@@ -28,7 +28,7 @@ LAYERS = {
     ),
     "network": (
         "vn",
-        "neighbours",
+        "neighbors",
         "encoder",
         "local_field",
         "decoder",

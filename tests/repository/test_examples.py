@@ -88,7 +88,7 @@ def test_a_mesh_from_one_view_is_closed_and_its_verdict_follows_from_its_figures
     assert ("tells more" in text) == (by_mesh < by_view)
     assert (
         number_after("mesh to the true surface:", text) < 20
-    )  # centimetres: around the chair, if not its shape
+    )  # centimeters: around the chair, if not its shape
 
 
 @pytest.mark.slow

@@ -1,4 +1,4 @@
-"""E57: every scan moved by its pose, in one frame; colours where all scans have them; no instances."""
+"""E57: every scan moved by its pose, in one frame; colors where all scans have them; no instances."""
 
 import sys
 
@@ -34,7 +34,7 @@ def test_scans_are_posed_and_merged_in_order(tmp_path):
     assert found.instance is None and found.colors is None and found.unit == "m"
 
 
-def test_colours_need_every_scan_to_have_them(tmp_path):
+def test_colors_need_every_scan_to_have_them(tmp_path):
     rgb = RNG.integers(0, 256, (300, 3)).astype(np.uint8)
     one = {"points": POINTS[:100], "colors": rgb[:100]}
     both = cloud(write_e57(tmp_path / "a.e57", [one, {"points": POINTS[100:], "colors": rgb[100:]}]))

@@ -1,4 +1,4 @@
-"""LAS and LAZ: coordinates by scale and offset, an extra dimension names the instance, colours of 16 bits."""
+"""LAS and LAZ: coordinates by scale and offset, an extra dimension names the instance, colors of 16 bits."""
 
 import sys
 
@@ -32,7 +32,7 @@ def test_far_coordinates_keep_the_files_precision(tmp_path):
     np.testing.assert_allclose(scan.instances[0].points, far[IDS == 3], rtol=0, atol=5.2e-5)
 
 
-def test_eight_bit_colours_in_sixteen_stay(tmp_path):
+def test_eight_bit_colors_in_sixteen_stay(tmp_path):
     rgb = RNG.integers(0, 256, (500, 3)).astype(np.uint16)
     scan = read_scan(write_las(tmp_path / "a.laz", POINTS, rgb, instance=IDS))
     np.testing.assert_array_equal(scan.instances[0].colors, rgb[IDS == 3])

@@ -10,7 +10,7 @@ from more2_jax.scans.formats import scannetpp
 from more2_jax.scans.formats.scannet import axis_alignment
 from more2_jax.scans.labeled_cloud import ReadOptions
 from more2_jax.scans.read_scan import read_scan
-from more2_jax.scans.structural_labels import BACKGROUND_LABELS, is_background, normalised
+from more2_jax.scans.structural_labels import BACKGROUND_LABELS, is_background, normalized
 from more2_jax.scans.threerscan_index import CATEGORIES
 
 RNG = np.random.default_rng(3)
@@ -144,7 +144,7 @@ def test_labels_of_the_room_and_of_no_object_are_background():
     for label in ("wall", "Floor", "ceiling", "door_frame", "Door-Frame", "window", "REMOVE", "unlabeled"):
         assert is_background(label), label
     assert not is_background(None)
-    assert {normalised(label) for label in BACKGROUND_LABELS} == BACKGROUND_LABELS
+    assert {normalized(label) for label in BACKGROUND_LABELS} == BACKGROUND_LABELS
 
 
 def test_no_category_that_moves_is_background():

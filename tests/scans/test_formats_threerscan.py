@@ -99,7 +99,7 @@ def test_back_projected_frames_lie_on_the_wall_they_saw(tmp_path, zipped):
     points, sensors, skipped = threerscan.depth_points(threerscan.open_sequence(tmp_path))
     assert len(points) == 3 * 48 * 64 and skipped == ()
     np.testing.assert_allclose(sensors, EYES, atol=1e-6)
-    # half a millimetre of rounding along rays up to 1.2 times as long as their depth
+    # half a millimeter of rounding along rays up to 1.2 times as long as their depth
     assert np.abs(points @ PLANE[0] - PLANE[1]).max() < 1e-3
 
 
@@ -167,7 +167,7 @@ def test_many_frames_are_thinned_evenly_and_always_alike(tmp_path, monkeypatch):
     points, sensors, _ = threerscan.depth_points(threerscan.open_sequence(tmp_path))
     assert len(points) == 4 * 12 * 16
     np.testing.assert_allclose(sensors[:, 2], [0, 3, 6, 9])
-    np.testing.assert_allclose(np.unique(points[:, 2]), [1, 4, 7, 10])  # frames 0, 3, 6, 9, a metre ahead
+    np.testing.assert_allclose(np.unique(points[:, 2]), [1, 4, 7, 10])  # frames 0, 3, 6, 9, a meter ahead
     again, *_ = threerscan.depth_points(threerscan.open_sequence(tmp_path))
     np.testing.assert_array_equal(points, again)
 

@@ -1,4 +1,4 @@
-"""Scans read back what was written, in metres; anything wrong with a file is one clear line."""
+"""Scans read back what was written, in meters; anything wrong with a file is one clear line."""
 
 from pathlib import Path
 
@@ -71,10 +71,10 @@ def test_label_beside_the_instance_is_the_label(tmp_path):
     assert [i.label for i in scan.instances] == ["41", "5"]
 
 
-def test_ply_colours(tmp_path):
+def test_ply_colors(tmp_path):
     rgb = RNG.integers(0, 256, (500, 3)).astype(np.uint8)
-    colours = {c: rgb[:, i] for i, c in enumerate(("red", "green", "blue"))}
-    scan = read_scan(two_instances(tmp_path / "a.ply", **colours))
+    colors = {c: rgb[:, i] for i, c in enumerate(("red", "green", "blue"))}
+    scan = read_scan(two_instances(tmp_path / "a.ply", **colors))
     np.testing.assert_array_equal(scan.instances[1].colors, rgb[IDS == 7])
 
 
@@ -135,7 +135,7 @@ def test_small_instances_are_skipped_and_said(tmp_path):
 
 
 @pytest.mark.parametrize(("unit", "scale"), [("m", 1.0), ("cm", 100.0), ("mm", 1000.0)])
-def test_units_scale_to_metres(tmp_path, unit, scale):
+def test_units_scale_to_meters(tmp_path, unit, scale):
     path = two_instances(tmp_path / "a.ply", points=scale * POINTS / 4)
     scan = read_scan(path, unit=unit)
     np.testing.assert_allclose(scan.instances[0].points, POINTS[IDS == 3] / 4, rtol=1e-12)
@@ -145,7 +145,7 @@ def test_units_scale_to_metres(tmp_path, unit, scale):
         assert f"--unit {unit}" in warning
 
 
-def test_metres_read_as_millimetres_warn(tmp_path):
+def test_meters_read_as_millimeters_warn(tmp_path):
     (warning,) = read_scan(two_instances(tmp_path / "a.ply"), unit="mm").warnings
     assert "--unit m" in warning and "--unit mm" not in warning
 

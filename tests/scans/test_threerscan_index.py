@@ -54,7 +54,7 @@ def write(tmp_path, *places):
     return file
 
 
-@pytest.mark.parametrize("scale", [1.0, 1000.0])  # metres; the first release, millimetres
+@pytest.mark.parametrize("scale", [1.0, 1000.0])  # meters; the first release, millimeters
 def test_poses_take_the_rescan_to_the_reference(tmp_path, scale):
     (found,) = read_index(write(tmp_path, place(scale))).places
     (rescan,) = found.rescans

@@ -30,7 +30,7 @@ def run_quickly(*scans: Path, out: Path, prior: Path, unit: str = "m", more: Seq
 
 
 def boxes(shift: float = 0.0, count: int = 2) -> tuple[np.ndarray, np.ndarray]:
-    """Points of `count` boxes of different proportions beside each other, metres, and their instance ids."""
+    """Points of `count` boxes of different proportions beside each other, meters, and their instance ids."""
     rng = np.random.default_rng(0)
     sizes = np.array([[1.0, 0.5, 0.3], [0.4, 0.4, 1.2], [0.8, 0.9, 0.5]])[:count]
     clouds = [rng.uniform(-0.5, 0.5, (100, 3)) * s + [2.0 * k + shift, 0, 0] for k, s in enumerate(sizes)]

@@ -5,7 +5,7 @@ from typing import Any
 
 import jax
 
-# Less optimised programs compile several times faster, run slower, and compute the same up to rounding. Where rounding
+# Less optimized programs compile several times faster, run slower, and compute the same up to rounding. Where rounding
 # decides, as in laws in float32, tests use what users run: `jax.jit` as it is.
 QUICKLY = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
 

@@ -1,4 +1,4 @@
-"""A small living scene by hand: every way an object can come and go, a kilometre from the world's zero."""
+"""A small living scene by hand: every way an object can come and go, a kilometer from the world's zero."""
 
 import numpy as np
 
@@ -27,7 +27,7 @@ def turn_z(angle: float, center: np.ndarray, shift: np.ndarray) -> np.ndarray:
 
 
 def cube(center: np.ndarray) -> Mesh:
-    """The surface of a cube with an edge of one metre."""
+    """The surface of a cube with an edge of one meter."""
     corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)]) - 0.5
     quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
     faces = [t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))]

@@ -11,7 +11,7 @@ import numpy as np
 
 ENCODER, DECODER = "network_dict.encoder.", "network_dict.decoder."
 THINNING = {2: 2, 4: 4, 5: 4}  # on entering these blocks, by these factors
-FIRST_ATTENTION, NEIGHBOURS, HEAD, SCALE, LEAK = 2, 16, 16, 64000.0, 0.2
+FIRST_ATTENTION, NEIGHBORS, HEAD, SCALE, LEAK = 2, 16, 16, 64000.0, 0.2
 Weights = Mapping[str, np.ndarray]
 
 
@@ -33,7 +33,7 @@ def vn_leaky_relu(direction: np.ndarray, q: np.ndarray) -> np.ndarray:
     return q - along * k + np.where(along >= 0, along, LEAK * along) * k
 
 
-def channel_normalise(x: np.ndarray) -> np.ndarray:
+def channel_normalize(x: np.ndarray) -> np.ndarray:
     """Unit direction of every channel times its share of the norm over the channels."""
     length = np.linalg.norm(x, axis=-1, keepdims=True)
     direction = np.divide(x, length, out=np.zeros_like(x), where=length > 0)
@@ -65,9 +65,9 @@ def graph_feature(query: np.ndarray, source: np.ndarray, k: int, first: bool) ->
 
 
 def attention(weights: Weights, i: int, query: np.ndarray, graph: np.ndarray) -> np.ndarray:
-    """Softmax over neighbours of ⟨Q, K⟩ / √(3·16) a head, weighted sum of V, then the global context."""
-    q = channel_normalise(vnla(weights, f"{ENCODER}Q_list.{i}", query))
-    k = channel_normalise(vnla(weights, f"{ENCODER}K_list.{i}", graph))
+    """Softmax over neighbors of ⟨Q, K⟩ / √(3·16) a head, weighted sum of V, then the global context."""
+    q = channel_normalize(vnla(weights, f"{ENCODER}Q_list.{i}", query))
+    k = channel_normalize(vnla(weights, f"{ENCODER}K_list.{i}", graph))
     v = vnla(weights, f"{ENCODER}V_list.{i}", graph)
     mixed = np.zeros((len(q), v.shape[2], 3))
     for h in range(0, v.shape[2], HEAD):
@@ -92,16 +92,16 @@ def encode(weights: Weights, points: np.ndarray) -> dict[str, np.ndarray]:
             farthest_from_first(xyz, len(xyz) // THINNING.get(i, 1)) if i in THINNING else np.arange(len(xyz))
         )
         query = features[kept]
-        graph = graph_feature(query, features, NEIGHBOURS, first=i == 0)
+        graph = graph_feature(query, features, NEIGHBORS, first=i == 0)
         if i < FIRST_ATTENTION:
             features = vnla(weights, f"{ENCODER}V_list.{i}", graph).mean(axis=1)
         else:
             features = attention(weights, i, query, graph)
         xyz = xyz[kept]
     x = vnla(weights, f"{ENCODER}conv_c", features).mean(axis=0)
-    eqv = channel_normalise(x)
+    eqv = channel_normalize(x)
     return {
-        "F_inv": (channel_normalise(linear(weights[f"{ENCODER}fc_inv.weight"], x)) * eqv).sum(axis=-1),
+        "F_inv": (channel_normalize(linear(weights[f"{ENCODER}fc_inv.weight"], x)) * eqv).sum(axis=-1),
         "F_eqv": eqv,
         "F_s": SCALE * np.linalg.norm(x, axis=-1).mean(),
         "F_c": mean + SCALE * _center(weights, x),

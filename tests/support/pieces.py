@@ -26,7 +26,7 @@ def without_symmetry() -> tuple[SourceMesh, ...]:
 
 
 def surface(mesh: SourceMesh, count: int, seed: int = 0) -> np.ndarray:
-    """Points on the surface of a piece standing on z = 0, metres."""
+    """Points on the surface of a piece standing on z = 0, meters."""
     solid = trimesh.Trimesh(standing(mesh.vertices), mesh.faces, process=False)
     return np.asarray(trimesh.sample.sample_surface(solid, count, seed=seed)[0])
 
@@ -44,7 +44,7 @@ def pose(rotation: Rotation, shift: np.ndarray) -> np.ndarray:
 
 
 def random_pose(rng: np.random.Generator, *, upright: bool, reach: float = 3.0) -> np.ndarray:
-    """Any rotation, or (`upright`) any turn about the vertical, and a shift of up to `reach` metres an axis."""
+    """Any rotation, or (`upright`) any turn about the vertical, and a shift of up to `reach` meters an axis."""
     turn = (
         Rotation.from_euler("z", rng.uniform(0, 2 * np.pi)) if upright else Rotation.random(random_state=rng)
     )
@@ -57,7 +57,7 @@ def apply(T: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 
 def pose_error(got: np.ndarray, expected: np.ndarray, points: np.ndarray) -> tuple[float, float]:
-    """Degrees between two poses, and metres between where they bring the points' mean."""
+    """Degrees between two poses, and meters between where they bring the points' mean."""
     turn = Rotation.from_matrix(got[:3, :3].T @ expected[:3, :3]).magnitude()
     middle = points.mean(axis=0, keepdims=True)
     return float(np.rad2deg(turn)), float(np.linalg.norm(apply(got, middle) - apply(expected, middle)))

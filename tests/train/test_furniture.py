@@ -1,4 +1,4 @@
-"""Mesh collections: what is packed comes back, what is damaged is refused; unseen furniture is in metres."""
+"""Mesh collections: what is packed comes back, what is damaged is refused; unseen furniture is in meters."""
 
 import dataclasses
 from pathlib import Path
@@ -64,15 +64,15 @@ def test_a_folder_of_meshes(tmp_path: Path):
     np.testing.assert_allclose(np.ptp(found["chair/one.obj"].vertices, axis=0), (1, 2, 3))
 
 
-def test_a_table_names_category_split_and_licence(tmp_path: Path):
+def test_a_table_names_category_split_and_license(tmp_path: Path):
     (tmp_path / "meshes").mkdir()
     trimesh.creation.box((1, 2, 3)).export(tmp_path / "meshes" / "one.off")
     trimesh.creation.icosphere(1).export(tmp_path / "meshes" / "two.stl")
     table = tmp_path / "list.csv"
-    table.write_text("path,category,split,licence\nmeshes/one.off,chair,test,CC0\nmeshes/two.stl,,,\n")
+    table.write_text("path,category,split,license\nmeshes/one.off,chair,test,CC0\nmeshes/two.stl,,,\n")
     one, two = read_meshes(table)
-    assert (one.category, one.split, one.licence, one.chosen_split) == ("chair", "test", "CC0", "test")
-    assert (two.category, two.split, two.licence) == ("object", None, "unknown")
+    assert (one.category, one.split, one.license, one.chosen_split) == ("chair", "test", "CC0", "test")
+    assert (two.category, two.split, two.license) == ("object", None, "unknown")
     table.write_text("path,split\nmeshes/one.off,tomorrow\n")
     with pytest.raises(ValueError, match="split 'tomorrow'; needed train, val, test"):
         list(read_meshes(table))
@@ -107,7 +107,7 @@ def test_shapenet_layout_with_its_table_of_splits(tmp_path: Path):
     first, second = read_meshes(tmp_path, report=told.__setitem__)
     assert (first.name, first.category, first.split) == (f"{synset}/a1", "chair", "test")
     assert second.split is None
-    assert "ShapeNet" in second.licence
+    assert "ShapeNet" in second.license
     assert list(told) == [f"{synset}/c3"]
     assert "model_normalized.obj" in told[f"{synset}/c3"]
 
@@ -164,12 +164,12 @@ def test_unseen_furniture_is_metric_and_every_piece_is_attributed():
     assert len(found) >= 12
     assert len({m.name for m in found}) == len(found)
     assert UNSEEN.stat().st_size <= 600_000
-    licences = UNSEEN.with_suffix(".LICENSES.md").read_text()
+    licenses = UNSEEN.with_suffix(".LICENSES.md").read_text()
     for m in found:
         check_mesh(m)
         np.testing.assert_allclose(standing(m.vertices), m.vertices, atol=1e-4)
         assert 0.2 < np.ptp(m.vertices, axis=0).max() < 2.5, m.name
-        assert f"catalogue number {int(m.name[-3:])})" in licences
+        assert f"catalog number {int(m.name[-3:])})" in licenses
 
 
 def test_ikea_gets_a_size_and_stands_up(tmp_path: Path):

@@ -118,7 +118,7 @@ def test_a_ball_is_empty_and_nothing_else_is_gone():
     assert gone.any(axis=1).all()
     distance = np.linalg.norm(points[:, None] - points[None], axis=-1)
     for row in gone:
-        farthest_gone = distance[row].max(axis=0)  # from every point as the centre
+        farthest_gone = distance[row].max(axis=0)  # from every point as the center
         nearest_kept = np.where(row[:, None], np.inf, distance).min(axis=0)
         assert ((farthest_gone < nearest_kept) & (farthest_gone <= 0.2) & (nearest_kept > 0.05)).any()
     assert not np.asarray(each(lambda k: ball(k, CLOUD, 0.0))).any()
@@ -145,7 +145,7 @@ def test_a_fragment_is_the_points_nearest_to_one_of_them():
     other = np.random.default_rng(0).normal(size=(300, 3)).astype(np.float32)
     for key in KEYS[:10]:
         piece = np.asarray(local_piece(key, CLOUD, jnp.asarray(other), 20))
-        offset = piece - piece[0]  # nearest first: row 0 is the centre
+        offset = piece - piece[0]  # nearest first: row 0 is the center
         center = min(range(300), key=lambda c: np.abs(nearest_to(other, c, 20) - offset).max())
         np.testing.assert_allclose(offset, nearest_to(other, center, 20), atol=2e-6)
 
@@ -253,7 +253,7 @@ def test_flaws_happen_in_augmented_clouds_alone():
     np.testing.assert_array_equal(clean, clouds(*views, dataclasses.replace(CLEAN, **certain))[0])
 
 
-def test_a_jittered_centre_shifts_cloud_and_queries_alike():
+def test_a_jittered_center_shifts_cloud_and_queries_alike():
     data, index, key = shapes(), jnp.arange(4), jax.random.key(8)
     still = draw(key, data, index, CLEAN, 64)
     moved = draw(key, data, index, dataclasses.replace(CLEAN, center_jitter=0.05), 64)

@@ -16,7 +16,7 @@ from train.shards.signed_distance import BOX, check_signs, is_inside, signed_dis
 QUERIES = 8000
 
 
-def labelled(vertices: np.ndarray, faces: np.ndarray, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+def labeled(vertices: np.ndarray, faces: np.ndarray, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
     uniform, near = signed_distances(vertices, faces, np.random.default_rng(seed), QUERIES)
     return uniform.astype(np.float64), near.astype(np.float64)
 
@@ -24,7 +24,7 @@ def labelled(vertices: np.ndarray, faces: np.ndarray, seed: int = 0) -> tuple[np
 # --- the canonical frame ------------------------------------------------------------------------------------
 
 
-def test_canonical_is_centred_and_of_known_size():
+def test_canonical_is_centerd_and_of_known_size():
     vertices, scale = canonical(np.array([[1.0, 2, 3], [5, 4, 3], [2, 3, 3.5]]))
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     np.testing.assert_allclose(low + high, 0, atol=1e-12)
@@ -42,7 +42,7 @@ def test_canonical_refuses_what_has_no_size(bad: np.ndarray):
 
 
 def test_distances_of_a_sphere():
-    for query in labelled(*sphere(0.45, subdivisions=5)):
+    for query in labeled(*sphere(0.45, subdivisions=5)):
         error = query[:, 3] - (np.linalg.norm(query[:, :3], axis=1) - 0.45)
         assert np.abs(error).max() < 0.001
 
@@ -51,7 +51,7 @@ def test_distances_of_a_flat_box_in_any_orientation():
     half = np.array([0.45, 0.1, 0.02])
     box = trimesh.creation.box(2 * half)
     turn = Rotation.from_euler("xyz", [0.3, 0.5, 0.7]).as_matrix()
-    for query in labelled(box.vertices @ turn.T, np.asarray(box.faces)):
+    for query in labeled(box.vertices @ turn.T, np.asarray(box.faces)):
         error = query[:, 3] - box_distance(query[:, :3] @ turn, half)
         assert np.abs(error).max() < 4e-4  # half a step of float16
 
@@ -67,7 +67,7 @@ def test_distances_belong_to_the_rounded_positions():
 def test_signs_agree_with_winding_numbers(category: str):
     piece = procedural_mesh(category, 0)
     vertices, _ = canonical(piece.vertices)
-    query = np.concatenate(labelled(vertices, piece.faces))
+    query = np.concatenate(labeled(vertices, piece.faces))
     winding = pcu.triangle_soup_fast_winding_number(
         vertices, piece.faces.astype(np.int32), np.ascontiguousarray(query[:, :3])
     )
@@ -86,7 +86,7 @@ def test_signs_that_disagree_are_refused():
 
 
 def test_queries_fill_the_box_and_hug_the_surface():
-    uniform, near = labelled(*sphere(0.45))
+    uniform, near = labeled(*sphere(0.45))
     assert uniform.shape == near.shape == (QUERIES, 4)
     np.testing.assert_allclose(uniform[:, :3].std(axis=0), BOX / np.sqrt(3), rtol=0.03)
     assert np.abs(uniform[:, :3]).max() <= BOX
@@ -98,7 +98,7 @@ def test_queries_fill_the_box_and_hug_the_surface():
 def test_a_seed_decides_alone():
     piece = procedural_mesh("bench", 0)
     vertices, _ = canonical(piece.vertices)
-    one, again, other = (labelled(vertices, piece.faces, seed)[1] for seed in (0, 0, 1))
+    one, again, other = (labeled(vertices, piece.faces, seed)[1] for seed in (0, 0, 1))
     np.testing.assert_array_equal(one, again)
     assert not np.array_equal(one, other)
 

@@ -1,4 +1,4 @@
-"""Catalogue furniture: centimetres and y up become metres and z up; rotation is applied before the size."""
+"""Catalog furniture: centimeters and y up become meters and z up; rotation is applied before the size."""
 
 import io
 import zipfile
@@ -10,9 +10,9 @@ import trimesh
 from trimesh.exchange.obj import export_obj
 
 from train.furniture.collections import read_meshes
-from train.furniture.sweethome3d import kind_of, read_catalogue
+from train.furniture.sweethome3d import kind_of, read_catalog
 
-PROPERTIES = """# a catalogue
+PROPERTIES = """# a catalog
 license=Public domain
 name#1=Chair
 creator#1=Somebody
@@ -31,8 +31,8 @@ height#2=40
 
 
 @pytest.fixture
-def catalogue(tmp_path: Path) -> Path:
-    """Two pieces that share a model: a cube with a spike at the back on top (y up, front towards +z)."""
+def catalog(tmp_path: Path) -> Path:
+    """Two pieces that share a model: a cube with a spike at the back on top (y up, front toward +z)."""
     cube = trimesh.creation.box((2, 2, 2))
     spike = trimesh.Trimesh([[-1, 3, -1], [1, 1, -1], [-1, 1, -1]], [[0, 1, 2]], process=False)
     buffer = io.StringIO(export_obj(trimesh.util.concatenate([cube, spike])))
@@ -43,9 +43,9 @@ def catalogue(tmp_path: Path) -> Path:
     return path
 
 
-def test_pieces_stand_in_metres(catalogue: Path):
-    chair, lamp = read_catalogue(catalogue)
-    assert (chair.name, chair.creator, chair.licence, chair.id) == ("Chair", "Somebody", "Public domain", 1)
+def test_pieces_stand_in_meters(catalog: Path):
+    chair, lamp = read_catalog(catalog)
+    assert (chair.name, chair.creator, chair.license, chair.id) == ("Chair", "Somebody", "Public domain", 1)
     for piece, size in ((chair, (0.5, 0.6, 0.9)), (lamp, (0.2, 0.3, 0.4))):
         low, high = piece.vertices.min(axis=0), piece.vertices.max(axis=0)
         np.testing.assert_allclose(high - low, size, atol=1e-9)
@@ -56,21 +56,21 @@ def test_pieces_stand_in_metres(catalogue: Path):
     np.testing.assert_allclose(top, [-0.1, -0.15, 0.4], atol=1e-9)  # turned by +90° about the vertical
 
 
-def test_pieces_are_chosen_by_number(catalogue: Path):
-    assert [piece.name for piece in read_catalogue(catalogue, (2,))] == ["Lamp"]
+def test_pieces_are_chosen_by_number(catalog: Path):
+    assert [piece.name for piece in read_catalog(catalog, (2,))] == ["Lamp"]
 
 
-def test_what_is_no_catalogue_is_refused(tmp_path: Path):
+def test_what_is_no_catalog_is_refused(tmp_path: Path):
     (tmp_path / "text.sh3f").write_text("nothing")
     with zipfile.ZipFile(tmp_path / "empty.sh3f", "w") as archive:
         archive.writestr("other", "")
     for name in ("text.sh3f", "empty.sh3f", "missing.sh3f"):
-        with pytest.raises(ValueError, match="not a SweetHome3D catalogue"):
-            list(read_catalogue(tmp_path / name))
+        with pytest.raises(ValueError, match="not a SweetHome3D catalog"):
+            list(read_catalog(tmp_path / name))
 
 
-def test_furniture_gets_its_kind_and_the_rest_is_told(catalogue: Path, tmp_path: Path):
-    with zipfile.ZipFile(catalogue) as archive:
+def test_furniture_gets_its_kind_and_the_rest_is_told(catalog: Path, tmp_path: Path):
+    with zipfile.ZipFile(catalog) as archive:
         model = archive.read("models/chair.obj")
     text = PROPERTIES + (
         "name#3=Man\nmodel#3=/models/chair.obj\ncategory#3=Characters\nwidth#3=1\ndepth#3=1\nheight#3=1\n"
@@ -88,7 +88,7 @@ def test_furniture_gets_its_kind_and_the_rest_is_told(catalogue: Path, tmp_path:
         ("more_002", "lamp"),
         ("more_004", "cabinet"),
     ]
-    assert found[0].licence == "Public domain; Chair by Somebody"
+    assert found[0].license == "Public domain; Chair by Somebody"
     assert "Characters" in told["more_003"]
     assert "not readable" in told["more_005"]
 

@@ -21,7 +21,7 @@ from train.run.devices import connect, cores, shares
 # As few layers as there are kinds of them: these tests spend their time compiling.
 SETTINGS = """
 model:
-  encoder: {widths: [8, 8, 8], code: 8, neighbours: 4, head_channels: 8, points: 32,
+  encoder: {widths: [8, 8, 8], code: 8, neighbors: 4, head_channels: 8, points: 32,
             downsample_blocks: [2], downsample_factors: [2]}
   decoder: {hidden: 32, layers: 3, skip_layer: 2, dropout: 0.1}
 training: {steps: 60, batch: 8, learning_rate: 1.0e-3, queries: 32, raw_points: 64, max_views: 2, warmup_steps: 2,

@@ -20,7 +20,7 @@ from train.tools.widen import source_layer, widen
 
 NARROW = PriorConfig(
     encoder=EncoderConfig(
-        widths=(8, 8, 16), code=12, neighbours=4, head_channels=8, points=32, output_scale=100.0,
+        widths=(8, 8, 16), code=12, neighbors=4, head_channels=8, points=32, output_scale=100.0,
         downsample_blocks=(2,), downsample_factors=(2,),
     ),
     decoder=DecoderConfig(
@@ -77,7 +77,7 @@ def clouds(points: int, count: int = 3) -> tuple[jax.Array, jax.Array, jax.Array
 
 @jax.jit
 def outputs(prior: Prior, points: jax.Array, mask: jax.Array, queries: jax.Array) -> dict[str, jax.Array]:
-    """Codes of clouds, their centre, and distances around it, in units of the size of clouds."""
+    """Codes of clouds, their center, and distances around it, in units of the size of clouds."""
     codes = jax.vmap(functools.partial(encode_ordered, prior))(points, mask)
     # Random weights have any F_s: queries spread accordingly.
     asked = queries * codes.scale[:, None, None] + codes.center[:, None]
@@ -96,7 +96,7 @@ def test_codes_and_distances_stay(wider):
 def test_base_begins_as_the_shipped_small():
     config = load_config(ROOT / "configs" / "base.yaml", TrainingRun).model
     narrow = load_prior("small")
-    same = {k: getattr(narrow.config.encoder, k) for k in ("points", "neighbours", "downsample_factors")}
+    same = {k: getattr(narrow.config.encoder, k) for k in ("points", "neighbors", "downsample_factors")}
     wide = widen(narrow, changed(config, same), jax.random.key(0))
     assert_same(outputs(narrow, *clouds(256, 2)), outputs(wide, *clouds(256, 2)))
 

@@ -1,4 +1,4 @@
-"""Models of a benchmark: closed, in metres, z up, standing on z = 0; made once and kept in a folder."""
+"""Models of a benchmark: closed, in meters, z up, standing on z = 0; made once and kept in a folder."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from train.rooms.ray_scanner import yaw_symmetry
 
 VERSION = 1  # of how models are closed: another number makes them anew
 SMALLEST_M, LARGEST_M = 0.05, 5.0  # longest edge that furniture has
-GRID_DECIMALS = 6  # of vertices, metres
+GRID_DECIMALS = 6  # of vertices, meters
 
 
 def read_models(
@@ -29,14 +29,14 @@ def read_models(
     *,
     up: Literal["y", "z"] = "z",
     longest_m: float | Mapping[str, float] | None = None,
-    licence: str | None = None,
+    license: str | None = None,
     unreadable: dict[str, str] | None = None,
 ) -> list[SourceMesh]:
-    """The meshes of a collection in metres, z up, ordered by name; names are unique.
+    """The meshes of a collection in meters, z up, ordered by name; names are unique.
 
-    `heldout_ikea.npz` is recognised by its name and brought to plausible sizes. Of any other source `up` tells
+    `heldout_ikea.npz` is recognized by its name and brought to plausible sizes. Of any other source `up` tells
     the vertical axis, and `longest_m` (for all, or by category) the longest edge to scale each mesh to; without
-    it coordinates are metres. `licence` is for meshes that come without one. Unreadable ones go into
+    it coordinates are meters. `license` is for meshes that come without one. Unreadable ones go into
     `unreadable`, with the reason. Raises ValueError if there is no such collection, or it has no meshes.
     """
     if path.stem == "heldout_ikea":
@@ -49,8 +49,8 @@ def read_models(
     named: dict[str, SourceMesh] = {}
     for mesh in sorted(meshes, key=lambda m: (m.name, m.content_hash)):
         name = mesh.name if mesh.name not in named else f"{mesh.name}#{mesh.content_hash[:8]}"
-        known = mesh.licence != "unknown" or licence is None
-        named[name] = dataclasses.replace(mesh, name=name, licence=mesh.licence if known else licence)
+        known = mesh.license != "unknown" or license is None
+        named[name] = dataclasses.replace(mesh, name=name, license=mesh.license if known else license)
     return list(named.values())
 
 

@@ -17,7 +17,7 @@ __all__ = ["SourceMesh", "check_mesh", "name_digest", "read_meshes", "standing",
 def read_meshes(path: str | Path, report: Report | None = None) -> Iterator[SourceMesh]:
     """The meshes of a collection, as they came.
 
-    `path` is a packed .npz, a SweetHome3D catalogue (.sh3f), a .csv that lists mesh files, a folder in
+    `path` is a packed .npz, a SweetHome3D catalog (.sh3f), a .csv that lists mesh files, a folder in
     ShapeNet's layout, or a folder of mesh files (one category a sub-folder). A mesh that cannot be read goes
     to `report` (name, reason); without one it raises ValueError. Raises ValueError if `path` is none of these.
     """
@@ -26,7 +26,7 @@ def read_meshes(path: str | Path, report: Report | None = None) -> Iterator[Sour
         yield from (read_shapenet if is_shapenet(path) else read_folder)(path, report)
     elif not path.is_file() or path.suffix.lower() not in (".npz", ".sh3f", ".csv"):
         raise ValueError(
-            f"{path}: needed a packed .npz, a .sh3f catalogue, a .csv of mesh files"
+            f"{path}: needed a packed .npz, a .sh3f catalog, a .csv of mesh files"
             f" or a folder of {', '.join(MESH_SUFFIXES)}"
         )
     elif path.suffix.lower() == ".npz":

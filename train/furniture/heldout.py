@@ -1,4 +1,4 @@
-"""Furniture for evaluation, of sources that no training uses: metres, z up, standing on z = 0."""
+"""Furniture for evaluation, of sources that no training uses: meters, z up, standing on z = 0."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ import numpy as np
 from train.furniture.collections import SourceMesh, read_meshes, standing
 from train.furniture.sweethome3d import Z_UP
 
-IKEA_LICENCE = "CC-BY-4.0; IKEA-Manuals-at-Work"
-# The collection comes without a scale: the longest edge that such a piece usually has, metres.
+IKEA_LICENSE = "CC-BY-4.0; IKEA-Manuals-at-Work"
+# The collection comes without a scale: the longest edge that such a piece usually has, meters.
 IKEA_LONGEST_M = {"Bench": 1.0, "Chair": 0.85, "Desk": 1.2, "Misc": 0.8, "Shelf": 1.2, "Table": 1.0}
 
 
@@ -28,5 +28,5 @@ def read_ikea(path: str | Path) -> Iterator[SourceMesh]:
         vertices = mesh.vertices @ Z_UP.T
         vertices = vertices * (IKEA_LONGEST_M[category] / np.ptp(vertices, axis=0).max())
         yield dataclasses.replace(
-            mesh, category=category.lower(), vertices=standing(vertices), licence=IKEA_LICENCE
+            mesh, category=category.lower(), vertices=standing(vertices), license=IKEA_LICENSE
         )

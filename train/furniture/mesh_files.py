@@ -19,7 +19,7 @@ Report = Callable[[str, str], None]  # name of a mesh, and why it could not be r
 
 
 def read_mesh_file(
-    path: Path, name: str, category: str, source: str, licence: str = "unknown", split: Split | None = None
+    path: Path, name: str, category: str, source: str, license: str = "unknown", split: Split | None = None
 ) -> SourceMesh:
     """One mesh file. Raises ValueError if it is none, or has no faces."""
     try:
@@ -33,7 +33,7 @@ def read_mesh_file(
         vertices=vertices.reshape(-1, 3),
         faces=faces.reshape(-1, 3),
         source=source,
-        licence=licence,
+        license=license,
         split=split,
     )
 
@@ -50,7 +50,7 @@ def read_folder(folder: Path, report: Report | None = None) -> Iterator[SourceMe
 
 
 def read_table(table: Path, report: Report | None = None) -> Iterator[SourceMesh]:
-    """The meshes that a CSV lists: column `path`, relative to it, and optional category, split and licence.
+    """The meshes that a CSV lists: column `path`, relative to it, and optional category, split and license.
 
     A file that cannot be read goes to `report`; without one, and for a table that is none, ValueError.
     """
@@ -71,7 +71,7 @@ def _read_row(table: Path, row: dict[str, str]) -> SourceMesh:
         row["path"],
         (row.get("category") or "").strip() or "object",
         table.stem,
-        (row.get("licence") or "").strip() or "unknown",
+        (row.get("license") or row.get("licence") or "").strip() or "unknown",
         cast("Split | None", split),
     )
 

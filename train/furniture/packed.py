@@ -13,7 +13,7 @@ from train.furniture.source_mesh import SourceMesh, name_digest
 
 LEVELS = 65535.0  # of a packed coordinate
 NEEDED = {"vertices", "faces", "names", "n_vertices", "n_faces", "lo", "hi"}
-INFINIGEN_LICENCE = "output of Infinigen's generators (BSD-3-Clause)"
+INFINIGEN_LICENSE = "output of Infinigen's generators (BSD-3-Clause)"
 
 
 def write_packed(path: str | Path, meshes: Sequence[SourceMesh]) -> None:
@@ -33,7 +33,7 @@ def write_packed(path: str | Path, meshes: Sequence[SourceMesh]) -> None:
         faces=np.concatenate([m.faces for m in meshes]).astype(np.uint16 if most < 2**16 else np.uint32),
         names=np.array([m.name for m in meshes]),
         categories=np.array([m.category for m in meshes]),
-        licences=np.array([m.licence for m in meshes]),
+        licenses=np.array([m.license for m in meshes]),
         lo=low,
         hi=high,
         n_vertices=np.array([len(m.vertices) for m in meshes]),
@@ -55,22 +55,24 @@ def read_packed(path: Path) -> Iterator[SourceMesh]:
     faces = np.split(arrays["faces"], np.cumsum(arrays["n_faces"])[:-1])
     # A collection without categories is of one, which its file is named after.
     categories = arrays.get("categories", [path.stem.removeprefix("infinigen_")] * len(vertices))
-    licences = arrays.get("licences", [INFINIGEN_LICENCE if infinigen else "unknown"] * len(vertices))
+    licenses = arrays.get("licenses", arrays.get("licences"))
+    if licenses is None:
+        licenses = [INFINIGEN_LICENSE if infinigen else "unknown"] * len(vertices)
     rows = zip(
-        arrays["names"], categories, licences, vertices, faces, arrays["lo"], arrays["hi"], strict=True
+        arrays["names"], categories, licenses, vertices, faces, arrays["lo"], arrays["hi"], strict=True
     )
-    for name, category, licence, v, f, lo, hi in rows:
+    for name, category, license, v, f, lo, hi in rows:
         yield SourceMesh(
             name=str(name),
             category=str(category),
-            vertices=_in_metres(str(name) if infinigen else "", lo + v / LEVELS * (hi - lo)),
+            vertices=_in_meters(str(name) if infinigen else "", lo + v / LEVELS * (hi - lo)),
             faces=f.astype(np.int64),
             source=path.name,
-            licence=str(licence),
+            license=str(license),
         )
 
 
-def _in_metres(name: str, vertices: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, "v 3"]:
+def _in_meters(name: str, vertices: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, "v 3"]:
     """Infinigen's trash cans alone are not metric: the name decides on a height of 0.25 to 0.7 m."""
     if not name.startswith("TrashFactory"):
         return vertices

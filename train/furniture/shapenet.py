@@ -22,7 +22,7 @@ SYNSETS = {
     "04379243": "table",
 }
 MODEL_FILES = ("models/model_normalized.obj", "model.obj", "models/model_normalized.glb")
-LICENCE = "ShapeNet terms of use (research only)"
+LICENSE = "ShapeNet terms of use (research only)"
 
 
 def is_shapenet(folder: Path) -> bool:
@@ -47,7 +47,7 @@ def read_shapenet(folder: Path, report: Report | None = None) -> Iterator[Source
 def _read_model(model: Path, name: str, category: str, split: Split | None) -> SourceMesh:
     for file in MODEL_FILES:
         if (model / file).is_file():
-            return read_mesh_file(model / file, name, category, "shapenet", LICENCE, split)
+            return read_mesh_file(model / file, name, category, "shapenet", LICENSE, split)
     raise ValueError(f"{model}: no {MODEL_FILES[0]}; needed one")
 
 

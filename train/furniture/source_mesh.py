@@ -22,7 +22,7 @@ class SourceMesh:
     vertices: Float[np.ndarray, "v 3"]
     faces: Int[np.ndarray, "f 3"]
     source: str
-    licence: str = "unknown"
+    license: str = "unknown"
     split: Split | None = None  # where the collection says so itself
 
     @property

@@ -1,4 +1,4 @@
-"""Furniture of SweetHome3D catalogues (.sh3f): meshes in metres, z up, with licence and maker."""
+"""Furniture of SweetHome3D catalogs (.sh3f): meshes in meters, z up, with license and maker."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from jaxtyping import Float, Int
 from train.furniture.mesh_files import UNREADABLE, Report, attempt
 from train.furniture.source_mesh import SourceMesh
 
-# Catalogue frames have y up; ours z up.
+# Catalog frames have y up; ours z up.
 Z_UP = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
 
 
 @dataclass(frozen=True, kw_only=True)
 class Furniture:
-    """One piece: metres, z up, standing on z = 0 with the middle of its footprint at the origin."""
+    """One piece: meters, z up, standing on z = 0 with the middle of its footprint at the origin."""
 
     id: int
     name: str
     creator: str
-    licence: str
-    category: str  # the catalogue's own, such as "Living room"
+    license: str
+    category: str  # the catalog's own, such as "Living room"
     tags: str
     vertices: Float[np.ndarray, "v 3"]
     faces: Int[np.ndarray, "f 3"]
@@ -64,7 +64,7 @@ NOT_FURNITURE = ("Characters", "Vehicles", "Staircases", "Doors and windows")
 
 
 def read_furniture(path: str | Path, report: Report | None = None) -> Iterator[SourceMesh]:
-    """The furniture of a catalogue, its kind told by name and tags, with licence and maker.
+    """The furniture of a catalog, its kind told by name and tags, with license and maker.
 
     What is no furniture, or cannot be read, goes to `report`; without one the latter raises ValueError.
     """
@@ -75,7 +75,7 @@ def read_furniture(path: str | Path, report: Report | None = None) -> Iterator[S
         category = properties.get(f"category#{number}", "").strip()
         if category in NOT_FURNITURE:
             if report is not None:
-                report(name, f"catalogue category {category!r}; needed furniture")
+                report(name, f"catalog category {category!r}; needed furniture")
             continue
         yield from attempt(lambda: _as_source(archive, properties, number, name, path.name), name, report)  # noqa: B023
 
@@ -87,10 +87,10 @@ def _as_source(
         piece = _piece(archive, properties, number)
     except UNREADABLE as error:
         raise ValueError(f"{source}: piece {number}: not readable ({error})") from error
-    licence = f"{piece.licence or 'unknown'}; {piece.name} by {piece.creator or 'unknown'}"
+    license = f"{piece.license or 'unknown'}; {piece.name} by {piece.creator or 'unknown'}"
     kind = kind_of(f"{piece.name} {piece.tags}") or piece.category.lower() or "object"
     return SourceMesh(
-        name=name, category=kind, vertices=piece.vertices, faces=piece.faces, source=source, licence=licence
+        name=name, category=kind, vertices=piece.vertices, faces=piece.faces, source=source, license=license
     )
 
 
@@ -99,8 +99,8 @@ def kind_of(words: str) -> str | None:
     return next((kind for word, kind in KINDS.items() if word in words.lower()), None)
 
 
-def read_catalogue(path: str | Path, ids: tuple[int, ...] | None = None) -> Iterator[Furniture]:
-    """The pieces of a catalogue, or those with `ids`. Raises ValueError if it is not a catalogue."""
+def read_catalog(path: str | Path, ids: tuple[int, ...] | None = None) -> Iterator[Furniture]:
+    """The pieces of a catalog, or those with `ids`. Raises ValueError if it is not a catalog."""
     archive, properties, numbers = _open(Path(path))
     for number in numbers:
         if ids is None or number in ids:
@@ -108,12 +108,12 @@ def read_catalogue(path: str | Path, ids: tuple[int, ...] | None = None) -> Iter
 
 
 def _open(path: Path) -> tuple[zipfile.ZipFile, dict[str, str], list[int]]:
-    """The catalogue's archive, its properties and the numbers of its pieces."""
+    """The catalog's archive, its properties and the numbers of its pieces."""
     try:
         archive = zipfile.ZipFile(path)
         text = archive.read("PluginFurnitureCatalog.properties").decode("latin-1")
     except (OSError, KeyError, zipfile.BadZipFile) as error:
-        raise ValueError(f"{path}: not a SweetHome3D catalogue ({error}); needed a .sh3f file") from error
+        raise ValueError(f"{path}: not a SweetHome3D catalog ({error}); needed a .sh3f file") from error
     properties = dict(line.split("=", 1) for line in text.splitlines() if "=" in line and line[0] != "#")
     numbers = sorted(int(k.split("#")[1]) for k in properties if k.startswith("model#"))
     return archive, properties, numbers
@@ -137,7 +137,7 @@ def _piece(archive: zipfile.ZipFile, properties: dict[str, str], number: int) ->
         id=number,
         name=get("name"),
         creator=get("creator"),
-        licence=properties.get("license", "").strip(),
+        license=properties.get("license", "").strip(),
         category=get("category"),
         tags=get("tags"),
         vertices=vertices,

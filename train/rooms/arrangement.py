@@ -12,7 +12,7 @@ from train.rooms.ray_scanner import Pose, footprint_radius, free_spot
 
 TRIES = 500
 DENSEST = 1.0  # share of the floor that circles cannot exceed
-Circle = tuple[float, float, float]  # x, y, radius, metres
+Circle = tuple[float, float, float]  # x, y, radius, meters
 DECIMALS = 9  # of a pose: last bits, which differ between processors, are gone
 
 

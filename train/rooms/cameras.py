@@ -12,7 +12,7 @@ CLEAN = SensorConfig(
     cameras=3, width=720, height=540, noise_m=0.0, noise_per_m2=0.0, dropout=0.0, grazing_deg=89.0
 )
 SPARSE = SensorConfig(cameras=3, width=240, height=180)
-SECTOR_DEG = 70.0  # two neighbouring cameras inside the room stand at most so far apart, seen from its middle
+SECTOR_DEG = 70.0  # two neighboring cameras inside the room stand at most so far apart, seen from its middle
 CLEARANCE_M = 0.35  # between a camera and the circle about any object
 
 

@@ -37,7 +37,7 @@ class SensorConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class PlacedMesh:
-    """A model in the room: `T_room_model` maps its vertices (metres) into the room."""
+    """A model in the room: `T_room_model` maps its vertices (meters) into the room."""
 
     model: str
     vertices: Float[np.ndarray, "v 3"]
@@ -54,7 +54,7 @@ def upright_pose(yaw: float, x: float, y: float) -> Pose:
 
 
 def footprint_radius(vertices: Float[np.ndarray, "v 3"]) -> float:
-    """Radius about the model's origin that holds its footprint, metres."""
+    """Radius about the model's origin that holds its footprint, meters."""
     return float(np.linalg.norm(vertices[:, :2], axis=1).max())
 
 
@@ -75,9 +75,9 @@ def free_spot(
 def scan_room(
     placed: Sequence[PlacedMesh], room: tuple[float, float], config: SensorConfig, rng: np.random.Generator
 ) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, " n"]]:
-    """What cameras around the room see: points (metres, room frame) and the object each lies on, −1 for the floor.
+    """What cameras around the room see: points (meters, room frame) and the object each lies on, −1 for the floor.
 
-    `room` is the furnished floor, x by y metres about the origin; the cameras stand around it.
+    `room` is the furnished floor, x by y meters about the origin; the cameras stand around it.
     """
     return RoomCaster(placed, room).scan(camera_poses(room, config, rng), config, rng)
 
@@ -86,7 +86,7 @@ class RoomCaster:
     """Casts rays into a room: one ray tracer for all of its objects and, if there is one, its floor."""
 
     def __init__(self, placed: Sequence[PlacedMesh], floor: tuple[float, float] | None) -> None:
-        """`floor` is x by y metres about the origin; None for objects on nothing."""
+        """`floor` is x by y meters about the origin; None for objects on nothing."""
         vertices, faces, owner = [], [], []
         if floor is not None:
             box = trimesh.creation.box(extents=(*floor, 0.1))
@@ -105,7 +105,7 @@ class RoomCaster:
     def scan(
         self, cameras: Sequence[Camera], config: SensorConfig, rng: np.random.Generator
     ) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, " n"]]:
-        """What the cameras see: points (metres, room frame) and the object each lies on, −1 for the floor."""
+        """What the cameras see: points (meters, room frame) and the object each lies on, −1 for the floor."""
         seen = [self._view(*camera, config, rng) for camera in cameras]
         points, objects = (np.concatenate(part) for part in zip(*seen, strict=True))
         return points, objects

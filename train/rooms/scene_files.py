@@ -1,8 +1,8 @@
 """Scenes of a benchmark on disk: a folder a scene, with scans that `read_scan` reads, meshes, and the truth.
 
-scene_0000/scene.json            what is true: objects, roles, poses, cameras, licences; `digest` of it all
+scene_0000/scene.json            what is true: objects, roles, poses, cameras, licenses; `digest` of it all
 scene_0000/scan_0.npz            points, instance, label; and object, T_scan_model, seen, T_scan_camera
-scene_0000/meshes/<model>.ply    closed, metres, model frame: standing on z = 0
+scene_0000/meshes/<model>.ply    closed, meters, model frame: standing on z = 0
 """
 
 from __future__ import annotations
@@ -110,7 +110,7 @@ def scene_truth(scene: FlyingScene, facts: Mapping[str, Any], files: Mapping[str
             "mesh": files[o.model],
             "symmetry_order": o.symmetry_order,
             "source": o.source,
-            "licence": o.licence,
+            "license": o.license,
             "observations": [
                 {
                     "scan": k,
@@ -133,7 +133,7 @@ def read_benchmark(folder: str | Path) -> Iterator[FlyingScene]:
         p.parent for p in Path(folder).glob("scene_*/scene.json") if p.parent.suffix != ".partial"
     )
     if not folders:
-        raise ValueError(f"{folder}: no scene_*/scene.json; needed a benchmark that train.synthesise wrote")
+        raise ValueError(f"{folder}: no scene_*/scene.json; needed a benchmark that train.synthesize wrote")
     for scene in folders:
         yield read_scene(scene)
 
@@ -187,6 +187,6 @@ def _object(folder: Path, row: Mapping[str, Any], seen: list[dict[str, np.ndarra
         role=row["role"],
         seen={r["scan"]: seen[r["scan"]][row["id"]] for r in rows},
         symmetry_order=row["symmetry_order"],
-        licence=row["licence"],
+        license=row.get("license", row.get("licence", "unknown")),
         source=row["source"],
     )

@@ -53,14 +53,14 @@ class TrueObject:
     name: str
     model: str  # of identical objects the same
     category: str
-    vertices: Float[np.ndarray, "v 3"]  # metres, model frame: standing on z = 0
+    vertices: Float[np.ndarray, "v 3"]  # meters, model frame: standing on z = 0
     faces: np.ndarray
     instance: dict[int, int]
     T_scan_model: dict[int, Pose]
     role: Role = "moved"
     seen: dict[int, Bool[np.ndarray, " samples"]] = field(default_factory=dict)  # of `surface_samples`
     symmetry_order: int | None = None  # about the vertical, see `yaw_symmetry`; None: not measured
-    licence: str = "unknown"
+    license: str = "unknown"
     source: str = ""
 
     def visible(self, scan: int) -> float:
@@ -89,7 +89,7 @@ class FlyingScene:
 def flying_scene(
     models: Sequence[SourceMesh], config: FlyingConfig, rng: np.random.Generator, name: str = "room"
 ) -> FlyingScene:
-    """Furnishes a room with `models` (metres, z up; one twice for two identical objects) and scans it.
+    """Furnishes a room with `models` (meters, z up; one twice for two identical objects) and scans it.
 
     Raises ValueError if there are fewer models than roles, too few scans for them, or no room.
     """
@@ -113,7 +113,7 @@ def flying_scene(
                 T_scan_model={k: v.poses[n] for k, v in with_it.items()},
                 role=room.roles[n],
                 seen={k: v.seen[n] for k, v in with_it.items()},
-                licence=m.licence,
+                license=m.license,
                 source=m.source,
             )
         )
@@ -230,7 +230,7 @@ def _visit(
                     n: room.samples[n] @ p[:3, :3].T + p[:3, 3] for n, p in poses.items() if n in present
                 }
                 return Visit(
-                    scan=_labelled_scan(name, points, owner, ids, labels),
+                    scan=_labeled_scan(name, points, owner, ids, labels),
                     poses=poses,
                     ids={n: int(i) for n, i in zip(present, ids, strict=True)},
                     seen={n: caster.sees(cameras, sensor, s) for n, s in samples.items()},
@@ -258,7 +258,7 @@ def _cameras(
     return inside_cameras(config.room_m, taken, sensor, rng)
 
 
-def _labelled_scan(
+def _labeled_scan(
     name: str, points: np.ndarray, owner: np.ndarray, ids: np.ndarray, labels: Sequence[str]
 ) -> Scan:
     instances = [

@@ -74,7 +74,7 @@ def meet() -> None:
     """Exchanges something with the other processes as soon as they are there.
 
     On CPUs the first exchange opens the connections, and fails if another process comes to it over 30 seconds later;
-    after that there is time. Between here and the first step every process reads, initialises and compiles for itself.
+    after that there is time. Between here and the first step every process reads, initializes and compiles for itself.
     """
     if jax.process_count() > 1:
         multihost_utils.sync_global_devices("connected")

@@ -21,7 +21,7 @@ HALF = 0.62  # of the picture's width, canonical units
 MESHING = MeshingConfig(coarse=16, resolution=32)
 ON_SURFACE = 12_000  # points drawn of a mesh
 LIGHT = np.array([0.35, -0.55, 0.76])
-# The picture's axes: to the right, up, and towards the eye, which looks down from the front left.
+# The picture's axes: to the right, up, and toward the eye, which looks down from the front left.
 EYE = np.array([[0.83, 0.55, 0.0], [-0.23, 0.35, 0.91], [0.50, -0.76, 0.42]])
 
 

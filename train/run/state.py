@@ -28,11 +28,11 @@ class TrainingState:
 
     params: dict[str, Any]
     average: dict[str, Any]  # exponential moving average of the weights: what is shipped
-    optimiser: Any
+    optimizer: Any
     step: Array
 
 
-def optimiser(config: TrainingConfig) -> optax.GradientTransformation:
+def optimizer(config: TrainingConfig) -> optax.GradientTransformation:
     """Adam with clipped gradients; a step whose gradient is not finite is left out."""
     adam = optax.chain(optax.clip_by_global_norm(config.clip), optax.adam(learning_rate(config)))
     return optax.apply_if_finite(adam, max_consecutive_errors=20)
@@ -43,7 +43,7 @@ def initial_state(prior: Prior, config: TrainingConfig) -> TrainingState:
     return TrainingState(
         params=jax.tree.map(jnp.copy, prior.params),  # a step takes the old state's memory
         average=jax.tree.map(jnp.copy, prior.params),
-        optimiser=optimiser(config).init(prior.params),
+        optimizer=optimizer(config).init(prior.params),
         step=jnp.zeros((), jnp.int32),
     )
 
@@ -84,7 +84,7 @@ def training_step(
         return total_loss(prior, sample, config, dropout_key, mesh)
 
     gradient, terms = jax.grad(loss, has_aux=True)(state.params)
-    updates, opt_state = optimiser(config).update(gradient, state.optimiser, state.params)
+    updates, opt_state = optimizer(config).update(gradient, state.optimizer, state.params)
     params = optax.apply_updates(state.params, updates)
     # Early on the average follows quickly, or it would remember the random start for long.
     keep = jnp.minimum(config.ema, (1 + state.step) / (10 + state.step))
@@ -94,6 +94,6 @@ def training_step(
         state,
         params=params,  # pyright: ignore[reportArgumentType]
         average=average,
-        optimiser=opt_state,
+        optimizer=opt_state,
         step=state.step + 1,
     ), terms

@@ -10,7 +10,7 @@ from trimesh.ray.ray_pyembree import RayMeshIntersector
 VIEWS = 24
 POINTS_A_VIEW = 512
 PIXELS = 64  # a side
-DISTANCE = 1.6  # of the camera from the centre, canonical units
+DISTANCE = 1.6  # of the camera from the center, canonical units
 HALF_FIELD = 0.42  # tangent of half the field of view: the whole unit shape is seen
 
 

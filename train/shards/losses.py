@@ -92,7 +92,7 @@ def total_loss(
     terms = {
         "sdf": sdf_loss(predicted, sample.sdf, config.near_surface),
         "center": jnp.mean(jnp.linalg.norm(embedding.center - sample.center + 1e-12, axis=-1)),
-        # Where the paper has |1 − F_s|: the same minimum and slope there, but a scale that shrinks towards 0,
+        # Where the paper has |1 − F_s|: the same minimum and slope there, but a scale that shrinks toward 0,
         # where |1 − F_s| has no pull left on the product of all layers, is pushed back.
         "scale": jnp.mean(jnp.abs(jnp.log(embedding.scale))),
         "contrast": contrast_loss(embedding.inv[:, 0], embedding.inv[:, 1], config.contrast_temperature),

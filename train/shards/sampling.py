@@ -83,8 +83,8 @@ def _half_sample(
     if config.stretch > 0:
         surface = shapes.views[index].reshape(-1, 3)
         points, queries, sdf = stretched(stretch_key, points, queries, sdf, surface, config.stretch)
-    # The encoder centres its cloud itself: a shift of everything shifts F_c as much and changes nothing else. What
-    # makes F_c learnt is that queries stay canonical while partiality moves the mean of the cloud.
+    # The encoder centers its cloud itself: a shift of everything shifts F_c as much and changes nothing else. What
+    # makes F_c learned is that queries stay canonical while partiality moves the mean of the cloud.
     center = config.center_jitter * jax.random.normal(jitter_key, (3,))
     return TrainingSample(points=points + center, mask=mask, queries=queries + center, sdf=sdf, center=center)
 

@@ -19,7 +19,7 @@ FINGERPRINT_SIDE = 8  # of the grid of distances by which near-duplicates are fo
 
 @dataclass(frozen=True, kw_only=True)
 class Shape:
-    """A training shape: closed, centred, longest edge 0.9 (canonical units)."""
+    """A training shape: closed, centerd, longest edge 0.9 (canonical units)."""
 
     vertices: Float[np.ndarray, "v 3"]
     faces: Int[np.ndarray, "f 3"]
@@ -27,7 +27,7 @@ class Shape:
     sdf_uniform: Float[np.ndarray, "q 4"]  # float16: x y z and signed distance, negative inside
     sdf_near: Float[np.ndarray, "q 4"]
     fingerprint: Float[np.ndarray, "8 8 8"]  # float16 signed distances on a grid
-    meta: dict[str, Any]  # name, category, source, split, licence, hash, method, coverage, …
+    meta: dict[str, Any]  # name, category, source, split, license, hash, method, coverage, …
 
 
 def make_shape(mesh: SourceMesh, queries: int = QUERIES) -> Shape:
@@ -49,7 +49,7 @@ def make_shape(mesh: SourceMesh, queries: int = QUERIES) -> Shape:
         "category": mesh.category,
         "source": mesh.source,
         "split": mesh.chosen_split,
-        "licence": mesh.licence,
+        "license": mesh.license,
         "hash": mesh.content_hash,
         "units_per_canonical": scale,
         "method": solid.method,

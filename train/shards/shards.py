@@ -30,7 +30,7 @@ EXCLUDED = "excluded.json"
 
 @pytree
 class Shapes:
-    """Training shapes in canonical units (centred, longest edge 0.9), float16."""
+    """Training shapes in canonical units (centerd, longest edge 0.9), float16."""
 
     views: Float[Array, "shapes views n 3"]  # back-projected depth maps
     sdf_uniform: Float[Array, "shapes q 4"]  # x y z and signed distance, negative inside
@@ -67,7 +67,7 @@ def write_shard(path: Path, shapes: Sequence[Shape]) -> None:
 
 
 def _solid(shape: Shape) -> SourceMesh:
-    kept = {k: shape.meta[k] for k in ("name", "category", "source", "licence")}
+    kept = {k: shape.meta[k] for k in ("name", "category", "source", "license")}
     return SourceMesh(vertices=shape.vertices, faces=shape.faces, **kept)
 
 

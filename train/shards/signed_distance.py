@@ -39,8 +39,8 @@ def signed_distances(
     check_signs(
         vertices, faces, query[:: max(1, 2 * count // CHECKED)], inside[:: max(1, 2 * count // CHECKED)]
     )
-    labelled = np.column_stack([query, np.where(inside, -distance, distance)]).astype(np.float16)
-    return labelled[:count], labelled[count:]
+    labeled = np.column_stack([query, np.where(inside, -distance, distance)]).astype(np.float16)
+    return labeled[:count], labeled[count:]
 
 
 def is_inside(

@@ -1,7 +1,7 @@
-"""Makes the bundled demo scans: `python -m train.tools.bundle_demo --catalogue CATALOGUE.sh3f`.
+"""Makes the bundled demo scans: `python -m train.tools.bundle_demo --catalog CATALOG.sh3f`.
 
 Three visits to one room: two identical armchairs, a sofa that stays, a cabinet that goes, a lounger that
-comes, the rest moved and turned. The catalogue is SweetHome3D's BlendSwap-CC-0: CC0, and never trained on.
+comes, the rest moved and turned. The catalog is SweetHome3D's BlendSwap-CC-0: CC0, and never trained on.
 """
 
 from __future__ import annotations
@@ -13,13 +13,13 @@ import numpy as np
 from plyfile import PlyData, PlyElement
 
 from train.furniture.closed_solids import canonical
-from train.furniture.sweethome3d import Furniture, read_catalogue
+from train.furniture.sweethome3d import Furniture, read_catalog
 from train.rooms.ray_scanner import PlacedMesh, SensorConfig, scan_room, yaw_symmetry
 from train.rooms.visits import arrange
 from train.run.program import run
 from train.shards.depth_views import depth_views
 
-# Object of the room → piece of the catalogue.
+# Object of the room → piece of the catalog.
 ROOM = {"armchair_a": 86, "armchair_b": 86, "sofa": 132, "desk": 152, "chair": 101, "bookcase": 6}
 REMOVED, ADDED, STATIC = "cabinet", "lounger", "sofa"
 EXTRA = {REMOVED: 52, ADDED: 37}
@@ -27,17 +27,17 @@ SIZE_M = (7.0, 6.0)
 POINTS_AN_OBJECT, BACKGROUND_POINTS, FEWEST = 4500, 8000, 1500
 
 
-def main(catalogue: Path, out: Path = Path("more2_jax/assets/demo"), seed: int = 5) -> None:
+def main(catalog: Path, out: Path = Path("more2_jax/assets/demo"), seed: int = 5) -> None:
     """Renders the scans and writes their ground truth.
 
     Args:
-        catalogue: BlendSwap-CC-0.sh3f.
+        catalog: BlendSwap-CC-0.sh3f.
         out: folder for the scans, ground_truth.json, ground_truth_surfaces.npz and LICENSES.md.
         seed: of places, poses and noise.
     """
     rng = np.random.default_rng(seed)
     numbers = ROOM | EXTRA
-    pieces = {f.id: f for f in read_catalogue(catalogue, tuple(numbers.values()))}
+    pieces = {f.id: f for f in read_catalog(catalog, tuple(numbers.values()))}
     out.mkdir(parents=True, exist_ok=True)
     poses: dict[str, np.ndarray] = {}
     truth = []
@@ -52,7 +52,7 @@ def main(catalogue: Path, out: Path = Path("more2_jax/assets/demo"), seed: int =
     }
     (out / "ground_truth.json").write_text(json.dumps({"models": models, "scans": truth}, indent=1))
     np.savez_compressed(out / "ground_truth_surfaces.npz", **surfaces(pieces, rng))  # pyright: ignore[reportArgumentType]
-    (out / "LICENSES.md").write_text(licences(pieces))
+    (out / "LICENSES.md").write_text(licenses(pieces))
 
 
 def render(
@@ -112,7 +112,7 @@ def write_scan(path: Path, points: np.ndarray, instance: np.ndarray) -> None:
 
 
 def surfaces(pieces: dict[int, Furniture], rng: np.random.Generator) -> dict[str, np.ndarray]:
-    """Points of every model's outer surface, metres, model frame: what meshes are compared with."""
+    """Points of every model's outer surface, meters, model frame: what meshes are compared with."""
     result = {}
     for number, piece in pieces.items():
         low, high = piece.vertices.min(axis=0), piece.vertices.max(axis=0)
@@ -122,11 +122,11 @@ def surfaces(pieces: dict[int, Furniture], rng: np.random.Generator) -> dict[str
     return result
 
 
-def licences(pieces: dict[int, Furniture]) -> str:
+def licenses(pieces: dict[int, Furniture]) -> str:
     """Who made what."""
-    lines = [f"- {f.name} (catalogue number {k}), by {f.creator}" for k, f in sorted(pieces.items())]
+    lines = [f"- {f.name} (catalog number {k}), by {f.creator}" for k, f in sorted(pieces.items())]
     head = (
-        "# Furniture of the demo scans\n\nSweetHome3D's BlendSwap-CC-0 catalogue, public domain (CC0); models"
+        "# Furniture of the demo scans\n\nSweetHome3D's BlendSwap-CC-0 catalog, public domain (CC0); models"
         " from blendswap.com, converted by Emmanuel Puybaret. Not used in any training.\n\n"
     )
     return head + "\n".join(lines) + "\n"

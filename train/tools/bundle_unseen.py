@@ -1,6 +1,6 @@
-"""Packs furniture that no training uses: `python -m train.tools.bundle_unseen --catalogue CATALOGUE.sh3f`.
+"""Packs furniture that no training uses: `python -m train.tools.bundle_unseen --catalog CATALOG.sh3f`.
 
-The catalogue is SweetHome3D's BlendSwap-CC-0 (CC0); the pieces are others than the demo's.
+The catalog is SweetHome3D's BlendSwap-CC-0 (CC0); the pieces are others than the demo's.
 """
 
 from __future__ import annotations
@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 
 from train.furniture.collections import SourceMesh, write_packed
-from train.furniture.sweethome3d import Furniture, read_catalogue
+from train.furniture.sweethome3d import Furniture, read_catalog
 from train.run.program import run
 
-# Number in the catalogue → category.
+# Number in the catalog → category.
 PIECES = {
     4: "bedside table",
     39: "shelf",
@@ -33,19 +33,19 @@ PIECES = {
 }
 
 
-def main(catalogue: Path, out: Path = Path("tests/data/unseen_furniture.npz")) -> None:
-    """Writes the packed meshes (metres, z up, standing on z = 0) and, beside them, who made what.
+def main(catalog: Path, out: Path = Path("tests/data/unseen_furniture.npz")) -> None:
+    """Writes the packed meshes (meters, z up, standing on z = 0) and, beside them, who made what.
 
     Args:
-        catalogue: BlendSwap-CC-0.sh3f.
+        catalog: BlendSwap-CC-0.sh3f.
         out: the .npz.
     """
-    pieces = list(read_catalogue(catalogue, tuple(PIECES)))
+    pieces = list(read_catalog(catalog, tuple(PIECES)))
     write_packed(out, [packed(piece) for piece in pieces])
-    lines = [f"- {piece.name} (catalogue number {piece.id}), by {piece.creator}" for piece in pieces]
+    lines = [f"- {piece.name} (catalog number {piece.id}), by {piece.creator}" for piece in pieces]
     head = (
         f"# Furniture in {out.name}\n\n"
-        "SweetHome3D's BlendSwap-CC-0 catalogue, public domain (CC0): models from blendswap.com, converted\n"
+        "SweetHome3D's BlendSwap-CC-0 catalog, public domain (CC0): models from blendswap.com, converted\n"
         "by Emmanuel Puybaret. Used in no training.\n\n"
     )
     out.with_suffix(".LICENSES.md").write_text(head + "\n".join(lines) + "\n", encoding="utf-8")

@@ -115,11 +115,14 @@ def census(
     threshold: float,
 ) -> str:
     """The census in Markdown."""
-    lines = ["| source | licence | method | train | val | test |", "|---|---|---|---|---|---|"]
-    groups = Counter((m["source"], m["licence"].split(";")[0][:60], m["method"], m["split"]) for m in kept)
-    for source, licence, method in sorted({g[:3] for g in groups}):
-        counts = [groups[source, licence, method, s] for s in ("train", "val", "test")]
-        lines.append(f"| {source} | {licence} | {method} | {' | '.join(map(str, counts))} |")
+    lines = ["| source | license | method | train | val | test |", "|---|---|---|---|---|---|"]
+    groups = Counter(
+        (m["source"], m.get("license", m.get("licence", "")).split(";")[0][:60], m["method"], m["split"])
+        for m in kept
+    )
+    for source, license, method in sorted({g[:3] for g in groups}):
+        counts = [groups[source, license, method, s] for s in ("train", "val", "test")]
+        lines.append(f"| {source} | {license} | {method} | {' | '.join(map(str, counts))} |")
     total = Counter(m["split"] for m in kept)
     lines.append(f"| all | | | {total['train']} | {total['val']} | {total['test']} |")
     lines += ["", "| category | train | val | test |", "|---|---|---|---|"]

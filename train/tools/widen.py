@@ -1,8 +1,8 @@
 """Starts a wide prior from a trained narrow one: `python -m train.tools.widen --prior small --config … --out wide.npz`.
 
-Codes and distances stay what they were (to rounding, where points, neighbours and thinning are equal), so training goes
+Codes and distances stay what they were (to rounding, where points, neighbors and thinning are equal), so training goes
 on instead of beginning anew. New channels begin in one of two ways: with incoming weights of zero, where what they hold
-would change neighbours or norms, or with outgoing weights of zero elsewhere. The other side is random, so gradients
+would change neighbors or norms, or with outgoing weights of zero elsewhere. The other side is random, so gradients
 reach every channel. A new layer of the decoder begins as the identity, which ReLU leaves alone.
 """
 
@@ -46,7 +46,7 @@ CLOSED = Kept(0.0, 0.0, 0.0)  # both
 FAINT = Kept(old_to_new=0.01)
 
 # A weight's name in the encoder: how many parts stand side by side in its rows, and what new channels begin with. What
-# a block gives has to be zero in new channels (its neighbours are chosen by them), what an attention block mixes not.
+# a block gives has to be zero in new channels (its neighbors are chosen by them), what an attention block mixes not.
 RULES = (
     (r"first/value/kernel", 1, SILENT),
     (r"linear/value/kernel", 2, SILENT),
@@ -83,7 +83,7 @@ def main(prior: str, config: Path, out: Path, seed: int = 0) -> None:
 def widen(prior: Prior, config: PriorConfig, key: Array) -> Prior:
     """A prior of `config` that gives the codes (new channels zero) and distances of `prior`.
 
-    To rounding, and where `points`, `neighbours` and `downsample_factors` are equal. Raises ValueError, naming the
+    To rounding, and where `points`, `neighbors` and `downsample_factors` are equal. Raises ValueError, naming the
     setting, where `config` is narrower or of another structure.
     """
     check(prior.config, config)
@@ -186,7 +186,7 @@ def source_layer(layer: int, before: DecoderConfig, after: DecoderConfig) -> int
 
 
 def known_layer(known: Weights, config: DecoderConfig, layer: int | None) -> tuple[np.ndarray, np.ndarray]:
-    """A hidden layer's kernel, weight normalisation applied, and its bias; the identity for a new one."""
+    """A hidden layer's kernel, weight normalization applied, and its bias; the identity for a new one."""
     if layer is None:
         return np.eye(config.hidden), np.zeros(config.hidden)
     direction, gain, bias = (known[f"decoder/layer_{layer}/{k}"] for k in ("direction", "gain", "bias"))

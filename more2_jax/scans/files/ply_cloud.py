@@ -26,12 +26,12 @@ class PlyCloud:
 
     @property
     def integer_properties(self) -> list[str]:
-        """Names of the properties that could name an instance: integers that are not colours."""
+        """Names of the properties that could name an instance: integers that are not colors."""
         return [k for k, v in self.properties.items() if v.dtype.kind in "iu" and k not in COLOR_PROPERTIES]
 
     @property
     def colors(self) -> Int[np.ndarray, "n 3"] | None:
-        """Red, green, blue as uint8; None where the file has none. Float colours are taken as shares of 1."""
+        """Red, green, blue as uint8; None where the file has none. Float colors are taken as shares of 1."""
         if not all(c in self.properties for c in COLOR_PROPERTIES):
             return None
         rgb = np.stack([self.properties[c] for c in COLOR_PROPERTIES], axis=-1)
@@ -60,7 +60,7 @@ def cloud_of(path: Path, elements: PlyData) -> PlyCloud:
     scalars = {name: np.array(vertices[name]) for name in names if vertices.dtype[name].kind in "iuf"}
     if missing := [axis for axis in "xyz" if axis not in scalars]:
         raise ValueError(f"{path}: {', '.join(missing)} of the vertices are lists; needed numbers")
-    with np.errstate(invalid="ignore"):  # a signalling NaN: refused where coordinates are checked
+    with np.errstate(invalid="ignore"):  # a signaling NaN: refused where coordinates are checked
         points = np.stack([scalars.pop(axis).astype(np.float64) for axis in "xyz"], axis=-1)
     return PlyCloud(points=points, properties=scalars)
 

@@ -1,7 +1,7 @@
 """The raw depth frames of a 3RScan sequence: `sequence/` or `sequence.zip` (METHOD 8).
 
-`_info.txt` holds the pinhole intrinsics (row-major 4×4) and the units of depth in a metre; `frame-*.depth.pgm`
-is 16 bit, most significant byte first; `frame-*.pose.txt` is `T_world_camera`, row-major, metres. The camera
+`_info.txt` holds the pinhole intrinsics (row-major 4×4) and the units of depth in a meter; `frame-*.depth.pgm`
+is 16 bit, most significant byte first; `frame-*.pose.txt` is `T_world_camera`, row-major, meters. The camera
 looks along +z, x to the right, y down.
 """
 
@@ -28,7 +28,7 @@ PGM = re.compile(rb"P5" + GAP + rb"(\d{1,6})" + GAP + rb"(\d{1,6})" + GAP + rb"(
 
 @dataclass(frozen=True, kw_only=True)
 class Intrinsics:
-    """A pinhole camera; pixels, and units of depth in a metre."""
+    """A pinhole camera; pixels, and units of depth in a meter."""
 
     fx: float
     fy: float
@@ -160,7 +160,7 @@ def read_pose(content: bytes) -> Float[np.ndarray, "4 4"] | None:
 
 
 def is_rigid(T: Float[np.ndarray, "4 4"]) -> bool:
-    """Whether a matrix is finite, a proper rotation to within `RIGID`, and a shift below a thousand kilometres."""
+    """Whether a matrix is finite, a proper rotation to within `RIGID`, and a shift below a thousand kilometers."""
     if not np.isfinite(T).all() or np.abs(T).max() > 1e6 or np.abs(T[:3, :3]).max() > 2:
         return False
     R = T[:3, :3]
@@ -174,7 +174,7 @@ def back_project(
     T_world_camera: Float[np.ndarray, "4 4"],
     stride: int,
 ) -> Float[np.ndarray, "n 3"]:
-    """Points in the world of every `stride`-th pixel both ways that has a depth; row by row, metres (METHOD 8)."""
+    """Points in the world of every `stride`-th pixel both ways that has a depth; row by row, meters (METHOD 8)."""
     row, column = np.nonzero(depth[::stride, ::stride])
     row, column = row * stride, column * stride
     z = depth[row, column] / intrinsics.depth_shift

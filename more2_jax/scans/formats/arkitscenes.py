@@ -1,6 +1,6 @@
 """ARKitScenes (Baruch et al. 2021): a mesh beside oriented boxes, no masks.
 
-`<id>_3dod_mesh.ply` has the vertices in metres, z up; `<id>_3dod_annotation.json` lists `data[]` with `label` and
+`<id>_3dod_mesh.ply` has the vertices in meters, z up; `<id>_3dod_annotation.json` lists `data[]` with `label` and
 `segments.obbAligned`: `centroid`, `axesLengths` (whole lengths) and `normalizedAxes`, nine numbers of which
 every three are one axis.
 """
@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float
 
 from more2_jax.scans.files.json_file import read_json
 from more2_jax.scans.files.ply_cloud import read_ply
-from more2_jax.scans.labeled_cloud import LabelledCloud, ReadOptions
+from more2_jax.scans.labeled_cloud import LabeledCloud, ReadOptions
 from more2_jax.types import Skipped
 
 MESH, BOXES = "_3dod_mesh.ply", "_3dod_annotation.json"
@@ -25,7 +25,7 @@ ORTHONORMAL = 1e-2  # how far the published axes, rounded in the file, may be fr
 
 @dataclass(frozen=True, kw_only=True)
 class Box:
-    """An oriented box; metres, in the mesh's frame."""
+    """An oriented box; meters, in the mesh's frame."""
 
     label: str | None
     center: Float[np.ndarray, "3"]
@@ -38,25 +38,25 @@ class Box:
         return np.asarray((np.abs(along) <= self.lengths / 2).all(axis=1))
 
 
-def recognises(path: Path) -> bool:
+def recognizes(path: Path) -> bool:
     """Whether this is such a mesh, its boxes, or a folder with such a mesh."""
     if path.is_dir():
         return any(path.glob(f"*{MESH}"))
     return path.is_file() and path.name.endswith((MESH, BOXES))
 
 
-def read(path: Path, options: ReadOptions) -> LabelledCloud:
+def read(path: Path, options: ReadOptions) -> LabeledCloud:
     """Points in a box are its instance, numbered from 1 as in the file; where boxes overlap, of the smaller."""
     mesh = _mesh(path)
     cloud = read_ply(mesh)
     annotation = mesh.with_name(mesh.name.removesuffix(MESH) + BOXES)
     if options.masks or not (options.masks_needed or annotation.is_file()):
-        return LabelledCloud(points=cloud.points, instance=None, colors=cloud.colors, unit="m")
+        return LabeledCloud(points=cloud.points, instance=None, colors=cloud.colors, unit="m")
     if not annotation.is_file():
         raise ValueError(f"{mesh}: no {annotation.name} beside it; needed its boxes, or masks of your own")
     boxes = read_boxes(annotation)
     instance, skipped = _assign(boxes, cloud.points)
-    return LabelledCloud(
+    return LabeledCloud(
         points=cloud.points,
         instance=instance,
         colors=cloud.colors,

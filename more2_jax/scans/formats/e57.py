@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from more2_jax.scans.labeled_cloud import LabelledCloud, ReadOptions, one_line
+from more2_jax.scans.labeled_cloud import LabeledCloud, ReadOptions, one_line
 from more2_jax.types import Skipped
 
 CHUNK = 1_000_000  # points read at once: a header that lies about their number costs no memory
@@ -19,13 +19,13 @@ COLORS = ("colorRed", "colorGreen", "colorBlue")
 INVALID = ("cartesianInvalidState", "sphericalInvalidState")
 
 
-def recognises(path: Path) -> bool:
+def recognizes(path: Path) -> bool:
     """Whether this is an E57 file, by its suffix."""
     return path.is_file() and path.suffix.lower() == ".e57"
 
 
-def read(path: Path, options: ReadOptions) -> LabelledCloud:
-    """Every scan of the file, moved by its pose, in the file's order. The format has no instances, only metres."""
+def read(path: Path, options: ReadOptions) -> LabeledCloud:
+    """Every scan of the file, moved by its pose, in the file's order. The format has no instances, only meters."""
     try:
         from pye57 import libe57  # pyright: ignore[reportAttributeAccessIssue]
     except ImportError as error:
@@ -39,7 +39,7 @@ def read(path: Path, options: ReadOptions) -> LabelledCloud:
     except Exception as error:
         raise ValueError(f"{path}: truncated or damaged E57 ({one_line(error)})") from error
     colors = [color for _, color, _, _ in scans if color is not None]
-    return LabelledCloud(
+    return LabeledCloud(
         points=np.concatenate([np.zeros((0, 3)), *(points for points, *_ in scans)]),
         instance=None,
         colors=np.concatenate(colors) if scans and len(colors) == len(scans) else None,
@@ -54,7 +54,7 @@ def read(path: Path, options: ReadOptions) -> LabelledCloud:
 
 
 def _scan(libe57: Any, image: Any, node: Any) -> tuple[np.ndarray, np.ndarray | None, int, np.ndarray | None]:
-    """Points in the file's frame, colours, how many points were marked as invalid, and where the scanner stood.
+    """Points in the file's frame, colors, how many points were marked as invalid, and where the scanner stood.
 
     That is known where the scan has a pose: a scanner stands at the zero of its own points.
     """

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Int
 
 from more2_jax.scans.files.ply_cloud import INSTANCE_PROPERTIES
-from more2_jax.scans.labeled_cloud import LabelledCloud, ReadOptions, instance_ids, one_line
+from more2_jax.scans.labeled_cloud import LabeledCloud, ReadOptions, instance_ids, one_line
 
 CHUNK = 64_000_000  # bytes of points read at once: a header that lies about their number costs no memory
 COMPRESSED = 0x80  # in the point format of LAZ
@@ -23,18 +23,18 @@ LAYERS = {
 COLORS = ("red", "green", "blue")
 
 
-def recognises(path: Path) -> bool:
+def recognizes(path: Path) -> bool:
     """Whether this is a LAS or LAZ file, by its suffix."""
     return path.is_file() and path.suffix.lower() in (".las", ".laz")
 
 
-def read(path: Path, options: ReadOptions) -> LabelledCloud:
-    """Coordinates with the file's scale and offset, in float64; colours of 16 bits become 8."""
+def read(path: Path, options: ReadOptions) -> LabeledCloud:
+    """Coordinates with the file's scale and offset, in float64; colors of 16 bits become 8."""
     columns, integers = _columns(path, options.instance_property)
     name = _instance_name(path, integers, options)
     colors = [columns[c] for c in COLORS if c in columns]
     labels = columns.get("label") if name != "label" else None
-    return LabelledCloud(
+    return LabeledCloud(
         points=np.stack([columns[axis].astype(np.float64) for axis in "xyz"], axis=-1),
         instance=None if name is None else instance_ids(path, columns[name]),
         colors=_eight_bits(np.stack(colors, axis=-1)) if len(colors) == 3 else None,
@@ -43,7 +43,7 @@ def read(path: Path, options: ReadOptions) -> LabelledCloud:
 
 
 def _columns(path: Path, asked: str | None) -> tuple[dict[str, np.ndarray], list[str]]:
-    """Coordinates, colours and what may name instances; with the names of all integer dimensions."""
+    """Coordinates, colors and what may name instances; with the names of all integer dimensions."""
     try:
         import laspy
         import lazrs
@@ -127,7 +127,7 @@ def _check_layers(path: Path, header: Any, lazrs: Any) -> None:
 
 
 def _integers(point_format: Any) -> list[str]:
-    """Whole-number dimensions, one number a point, that are neither coordinates nor colours."""
+    """Whole-number dimensions, one number a point, that are neither coordinates nor colors."""
     plain = [d for d in point_format.dimensions if d.num_elements == 1 and d.kind.name != "FloatingPoint"]
     return [d.name for d in plain if not d.is_scaled and d.name not in ("X", "Y", "Z", *COLORS)]
 

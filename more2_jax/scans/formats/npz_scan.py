@@ -7,19 +7,19 @@ from pathlib import Path
 import numpy as np
 
 from more2_jax.scans.files.npz import read_arrays
-from more2_jax.scans.labeled_cloud import LabelledCloud, ReadOptions, instance_ids
+from more2_jax.scans.labeled_cloud import LabeledCloud, ReadOptions, instance_ids
 
 COLORS = ("color", "colors")  # the first that is there
 SENSORS, CAMERAS = "sensors", "T_scan_camera"  # places (s, 3), or poses (s, 4, 4) of cameras in the scan
 HOW = " (name the instances with --instance-property, or cut the scan with --segment geometric)"
 
 
-def recognises(path: Path) -> bool:
+def recognizes(path: Path) -> bool:
     """Whether this is an NPZ file, by its suffix."""
     return path.is_file() and path.suffix.lower() == ".npz"
 
 
-def read(path: Path, options: ReadOptions) -> LabelledCloud:
+def read(path: Path, options: ReadOptions) -> LabeledCloud:
     key = options.instance_property or "instance"
     arrays, names = read_arrays(path, ("points", key, "label", *COLORS, SENSORS, CAMERAS))
     segmented = not options.masks_needed and options.instance_property is None
@@ -27,7 +27,7 @@ def read(path: Path, options: ReadOptions) -> LabelledCloud:
         raise ValueError(f"{path}: arrays are {names}; needed {' and '.join(missing)} too" + HOW)
     _check_npz(path, arrays, key)
     labels = arrays.get("label") if key != "label" else None
-    return LabelledCloud(
+    return LabeledCloud(
         points=arrays["points"].astype(np.float64),
         instance=instance_ids(path, arrays[key]) if key in arrays else None,
         colors=_colors(next((arrays[k] for k in COLORS if k in arrays), None)),

@@ -12,7 +12,7 @@ from jaxtyping import Int
 
 from more2_jax.scans.files.lzf import decompress
 from more2_jax.scans.files.ply_cloud import INSTANCE_PROPERTIES
-from more2_jax.scans.labeled_cloud import LabelledCloud, ReadOptions
+from more2_jax.scans.labeled_cloud import LabeledCloud, ReadOptions
 
 LONGEST_HEADER = 65_536  # bytes
 LARGEST_EXACT = 2**53  # whole numbers that a text's float64 holds exactly
@@ -39,12 +39,12 @@ class Header:
         return tuple(t.itemsize * c for t, c in zip(self.types, self.counts, strict=True))
 
 
-def recognises(path: Path) -> bool:
+def recognizes(path: Path) -> bool:
     """Whether this is a PCD file, by its suffix."""
     return path.is_file() and path.suffix.lower() == ".pcd"
 
 
-def read(path: Path, options: ReadOptions) -> LabelledCloud:
+def read(path: Path, options: ReadOptions) -> LabeledCloud:
     """Coordinates as they are stored: VIEWPOINT is stated, not applied. Points without depth are left out.
 
     `rows` of the cloud says which were kept: masks beside the file speak of all its rows.
@@ -65,7 +65,7 @@ def read(path: Path, options: ReadOptions) -> LabelledCloud:
     name = _instance_field(path, columns, options)
     labels = columns.get("label") if name != "label" else None
     colors = next((_unpacked(columns[c]) for c in COLORS if c in columns), None)
-    return LabelledCloud(
+    return LabeledCloud(
         points=points[valid],
         instance=None if name is None else _whole(path, columns[name])[valid],
         colors=None if colors is None else colors[valid],

@@ -8,22 +8,22 @@ from pathlib import Path
 import numpy as np
 
 from more2_jax.scans.files.ply_cloud import read_ply
-from more2_jax.scans.labeled_cloud import LabelledCloud, ReadOptions
+from more2_jax.scans.labeled_cloud import LabeledCloud, ReadOptions
 from more2_jax.types import Skipped
 
 
-def recognises(path: Path) -> bool:
+def recognizes(path: Path) -> bool:
     """Whether this is a folder that holds PLY files."""
     return path.is_dir() and any(path.glob("*.ply"))
 
 
-def read(path: Path, options: ReadOptions) -> LabelledCloud:
+def read(path: Path, options: ReadOptions) -> LabeledCloud:
     """One PLY, one object; the options have nothing to choose here."""
     files = sorted(path.glob("*.ply"))
     clouds = [read_ply(file) for file in files]
     ids = _folder_ids([file.stem for file in files])
     colors = [cloud.colors for cloud in clouds if cloud.colors is not None]
-    return LabelledCloud(
+    return LabeledCloud(
         points=np.concatenate([cloud.points for cloud in clouds]),
         instance=np.repeat(np.array(ids, np.int64), [len(cloud.points) for cloud in clouds]),
         colors=np.concatenate(colors) if len(colors) == len(clouds) else None,

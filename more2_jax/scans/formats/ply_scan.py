@@ -7,19 +7,19 @@ from pathlib import Path
 import numpy as np
 
 from more2_jax.scans.files.ply_cloud import INSTANCE_PROPERTIES, PlyCloud, read_ply
-from more2_jax.scans.labeled_cloud import LabelledCloud, ReadOptions
+from more2_jax.scans.labeled_cloud import LabeledCloud, ReadOptions
 
 
-def recognises(path: Path) -> bool:
+def recognizes(path: Path) -> bool:
     """Whether this is a PLY file, by its suffix."""
     return path.is_file() and path.suffix.lower() == ".ply"
 
 
-def read(path: Path, options: ReadOptions) -> LabelledCloud:
+def read(path: Path, options: ReadOptions) -> LabeledCloud:
     cloud = read_ply(path)
     name = _instance_property(path, cloud, options)
     labels = cloud.properties.get("label") if name != "label" else None
-    return LabelledCloud(
+    return LabeledCloud(
         points=cloud.points,
         instance=None if name is None else cloud.properties[name].astype(np.int64),
         colors=cloud.colors,

@@ -1,7 +1,7 @@
-"""The formats of scans, the most particular first: the first that recognises a path reads it.
+"""The formats of scans, the most particular first: the first that recognizes a path reads it.
 
-A format is a module of this package with `recognises(path) -> bool`, which looks and never raises, and
-`read(path, options) -> LabelledCloud`, which raises ValueError, in one line, on what it cannot read.
+A format is a module of this package with `recognizes(path) -> bool`, which looks and never raises, and
+`read(path, options) -> LabeledCloud`, which raises ValueError, in one line, on what it cannot read.
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ from more2_jax.scans.formats import (
     scannetpp,
     threerscan,
 )
-from more2_jax.scans.labeled_cloud import LabelledCloud, ReadOptions
+from more2_jax.scans.labeled_cloud import LabeledCloud, ReadOptions
 
 
 class Format(Protocol):
     """What a format's module offers."""
 
-    def recognises(self, path: Path) -> bool:
+    def recognizes(self, path: Path) -> bool:
         """Whether the path is of this format, judged by names; never raises."""
         ...
 
-    def read(self, path: Path, options: ReadOptions) -> LabelledCloud:
+    def read(self, path: Path, options: ReadOptions) -> LabeledCloud:
         """The points and their instances. ValueError, in one line, if that fails."""
         ...
 

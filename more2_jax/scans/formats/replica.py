@@ -1,7 +1,7 @@
 """Replica (Straub et al. 2019): `habitat/mesh_semantic.ply`, whose faces carry the object, and its classes.
 
 Points are the vertices of each object's faces, so a vertex on the border of two objects is a point of both;
-vertices without a face are left out. The frame is the mesh's, z up, metres.
+vertices without a face are left out. The frame is the mesh's, z up, meters.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import numpy as np
 
 from more2_jax.scans.files.json_file import read_json
 from more2_jax.scans.files.ply_face_mesh import read_ply_mesh
-from more2_jax.scans.labeled_cloud import LabelledCloud, ReadOptions
+from more2_jax.scans.labeled_cloud import LabeledCloud, ReadOptions
 from more2_jax.scans.segment_groups import shift_of, whole_number
 from more2_jax.scans.structural_labels import drop_background
 from more2_jax.types import Skipped
@@ -21,12 +21,12 @@ MESH, CLASSES = "mesh_semantic.ply", "info_semantic.json"
 OBJECT = "object_id"
 
 
-def recognises(path: Path) -> bool:
+def recognizes(path: Path) -> bool:
     """Whether this is a scene's folder, its `habitat` folder, or the mesh in it."""
     return any(file.is_file() for file in _candidates(path))
 
 
-def read(path: Path, options: ReadOptions) -> LabelledCloud:
+def read(path: Path, options: ReadOptions) -> LabeledCloud:
     """The objects that `info_semantic.json` names; faces of any other id are background.
 
     Raises ValueError, in one line, when a file is missing or damaged, or faces carry no `object_id`.
@@ -34,7 +34,7 @@ def read(path: Path, options: ReadOptions) -> LabelledCloud:
     file = next(file for file in _candidates(path) if file.is_file())
     mesh = read_ply_mesh(file)
     if options.masks or not (options.masks_needed or file.with_name(CLASSES).is_file()):
-        return LabelledCloud(points=mesh.cloud.points, instance=None, colors=mesh.cloud.colors, unit="m")
+        return LabeledCloud(points=mesh.cloud.points, instance=None, colors=mesh.cloud.colors, unit="m")
     objects = mesh.face_properties.get(OBJECT)
     if objects is None or objects.dtype.kind not in "iu":
         raise ValueError(f"{file}: faces have no whole number {OBJECT}; needed the object of every face")
@@ -48,7 +48,7 @@ def read(path: Path, options: ReadOptions) -> LabelledCloud:
     empty = sorted(set(labels) - set(np.unique(instance).tolist()))
     instance, structural = drop_background(instance, labels)
     colors = mesh.cloud.colors
-    return LabelledCloud(
+    return LabeledCloud(
         points=mesh.cloud.points[vertex],
         instance=instance,
         colors=None if colors is None else colors[vertex],

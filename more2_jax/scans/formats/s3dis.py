@@ -1,4 +1,4 @@
-"""S3DIS (Armeni et al. 2016): a room with `Annotations/<class>_<number>.txt`, lines of x y z r g b, metres.
+"""S3DIS (Armeni et al. 2016): a room with `Annotations/<class>_<number>.txt`, lines of x y z r g b, meters.
 
 The published files have lines with stray control characters (Area_5/hallway_6/Annotations/ceiling_1.txt).
 Up to `MOST_DAMAGED` such lines of a file are left out, and a warning names the first; more are an error.
@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from more2_jax.scans.labeled_cloud import LabelledCloud, ReadOptions
+from more2_jax.scans.labeled_cloud import LabeledCloud, ReadOptions
 from more2_jax.scans.structural_labels import is_background
 from more2_jax.types import Skipped
 
@@ -24,12 +24,12 @@ COLUMNS = 6
 MOST_DAMAGED = 10  # lines of a file
 
 
-def recognises(path: Path) -> bool:
+def recognizes(path: Path) -> bool:
     """Whether this is a room's folder, or its folder of annotations."""
     return _folder(path) is not None
 
 
-def read(path: Path, options: ReadOptions) -> LabelledCloud:
+def read(path: Path, options: ReadOptions) -> LabeledCloud:
     """One file, one instance, numbered from 1 by class and number; walls, floors and the like are background.
 
     Raises ValueError, in one line with file and line number, when a file is damaged or no file has points.
@@ -53,7 +53,7 @@ def read(path: Path, options: ReadOptions) -> LabelledCloud:
         tables.append(table)
         ids.append(0 if structural else count)
     table = np.concatenate(tables)
-    return LabelledCloud(
+    return LabeledCloud(
         points=table[:, :3].copy(),
         instance=None if options.masks else np.repeat(np.array(ids, np.int64), [len(t) for t in tables]),
         colors=np.clip(np.nan_to_num(table[:, 3:]), 0, 255).astype(np.uint8),

@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from more2_jax.scans.files.ply_cloud import read_ply
 from more2_jax.scans.formats import ply_scan
-from more2_jax.scans.labeled_cloud import LabelledCloud, ReadOptions, one_line
+from more2_jax.scans.labeled_cloud import LabeledCloud, ReadOptions, one_line
 from more2_jax.scans.segment_groups import instances_of, read_groups, read_segment_indices
 from more2_jax.scans.structural_labels import drop_background
 
@@ -23,14 +23,14 @@ AGGREGATIONS = (".aggregation.json", "_vh_clean_2.aggregation.json")
 SHIFT = 1  # 0 is the first object there, background here
 
 
-def recognises(path: Path) -> bool:
+def recognizes(path: Path) -> bool:
     """Whether this is such a mesh, or a folder with one."""
     if path.is_dir():
         return any(path.glob(f"*{MESH}"))
     return path.is_file() and path.name.endswith(MESH)
 
 
-def read(path: Path, options: ReadOptions) -> LabelledCloud:
+def read(path: Path, options: ReadOptions) -> LabeledCloud:
     """The vertices, each in the instance that its segment belongs to; walls, floors and the like are background.
 
     Raises ValueError, in one line, when a file of the scene is missing, damaged or does not fit the mesh.
@@ -40,14 +40,14 @@ def read(path: Path, options: ReadOptions) -> LabelledCloud:
         return ply_scan.read(mesh, options)
     cloud = read_ply(mesh)
     if options.masks or not (options.masks_needed or _annotated(mesh)):
-        return LabelledCloud(points=cloud.points, instance=None, colors=cloud.colors, unit="m")
+        return LabeledCloud(points=cloud.points, instance=None, colors=cloud.colors, unit="m")
     groups = read_groups(_beside(mesh, *AGGREGATIONS))
     if any(group.id < 0 for group in groups):
         raise ValueError(f"{_beside(mesh, *AGGREGATIONS)}: a negative objectId; needed 0 or more")
     indices = read_segment_indices(_beside(mesh, SEGMENTS), len(cloud.points))
     instance, labels, empty = instances_of(groups, indices, SHIFT)
     instance, structural = drop_background(instance, labels)
-    return LabelledCloud(
+    return LabeledCloud(
         points=cloud.points,
         instance=instance,
         colors=cloud.colors,
@@ -58,7 +58,7 @@ def read(path: Path, options: ReadOptions) -> LabelledCloud:
 
 
 def axis_alignment(path: Path) -> Float[np.ndarray, "4 4"]:
-    """`T_aligned_mesh` of a scene (its folder or mesh) from `<scene>.txt`: 16 numbers, row-major, metres."""
+    """`T_aligned_mesh` of a scene (its folder or mesh) from `<scene>.txt`: 16 numbers, row-major, meters."""
     info = _beside(_mesh(path), ".txt")
     try:
         text = info.read_text(encoding="utf-8", errors="replace")

@@ -1,6 +1,6 @@
 """ScanNet++ (Yeshwanth et al. 2023): `scans/mesh_aligned_0.05.ply`, `segments.json`, `segments_anno.json`.
 
-Points are in the frame of the aligned mesh, z up, metres.
+Points are in the frame of the aligned mesh, z up, meters.
 """
 
 from __future__ import annotations
@@ -8,19 +8,19 @@ from __future__ import annotations
 from pathlib import Path
 
 from more2_jax.scans.files.ply_cloud import read_ply
-from more2_jax.scans.labeled_cloud import LabelledCloud, ReadOptions
+from more2_jax.scans.labeled_cloud import LabeledCloud, ReadOptions
 from more2_jax.scans.segment_groups import instances_of, read_groups, read_segment_indices, shift_of
 from more2_jax.scans.structural_labels import drop_background
 
 MESH, SEGMENTS, ANNOTATION = "mesh_aligned_0.05.ply", "segments.json", "segments_anno.json"
 
 
-def recognises(path: Path) -> bool:
+def recognizes(path: Path) -> bool:
     """Whether this is a scene's folder, its `scans` folder, or the mesh in it."""
     return any(file.is_file() for file in _candidates(path))
 
 
-def read(path: Path, options: ReadOptions) -> LabelledCloud:
+def read(path: Path, options: ReadOptions) -> LabeledCloud:
     """The vertices by annotated object, with its id (one more where the file counts from 0, and a warning).
 
     Raises ValueError, in one line, when a file of the scene is missing, damaged or does not fit the mesh.
@@ -28,7 +28,7 @@ def read(path: Path, options: ReadOptions) -> LabelledCloud:
     mesh = next(file for file in _candidates(path) if file.is_file())
     cloud = read_ply(mesh)
     if options.masks or not (options.masks_needed or mesh.with_name(ANNOTATION).is_file()):
-        return LabelledCloud(points=cloud.points, instance=None, colors=cloud.colors, unit="m")
+        return LabeledCloud(points=cloud.points, instance=None, colors=cloud.colors, unit="m")
     for name in (SEGMENTS, ANNOTATION):
         if not mesh.with_name(name).is_file():
             raise ValueError(f"{mesh}: no {name} beside it; needed the annotation, or masks of your own")
@@ -41,7 +41,7 @@ def read(path: Path, options: ReadOptions) -> LabelledCloud:
         raise ValueError(f"{annotation}: {error}") from error
     instance, labels, empty = instances_of(groups, indices, shift)
     instance, structural = drop_background(instance, labels)
-    return LabelledCloud(
+    return LabeledCloud(
         points=cloud.points,
         instance=instance,
         colors=cloud.colors,

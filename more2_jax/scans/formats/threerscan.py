@@ -1,8 +1,8 @@
 """3RScan (Wald et al. 2019; METHOD 8): a scan's folder, read from its annotated mesh or its raw depth frames.
 
 `labels.instances.annotated.v2.ply` gives every vertex its `objectId` (0: none), `semseg.v2.json` the labels.
-The mesh's colours paint the instances (`ply_color` of 3DSSG's `objects.json`), in which the truth shows: never read.
-Points are in the scan's own frame, z up, metres; `more2_jax.scans.threerscan_index` has the poses between scans.
+The mesh's colors paint the instances (`ply_color` of 3DSSG's `objects.json`), in which the truth shows: never read.
+Points are in the scan's own frame, z up, meters; `more2_jax.scans.threerscan_index` has the poses between scans.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from more2_jax.scans.files.rgbd_sequence import (
     read_pose,
 )
 from more2_jax.scans.formats import ply_scan
-from more2_jax.scans.labeled_cloud import LabelledCloud, ReadOptions, instance_ids
+from more2_jax.scans.labeled_cloud import LabeledCloud, ReadOptions, instance_ids
 from more2_jax.scans.segment_groups import read_groups
 from more2_jax.scans.structural_labels import drop_background
 from more2_jax.types import Skipped
@@ -39,14 +39,14 @@ MOST_POINTS = 2_000_000  # of all frames together
 NEAREST_M = 0.05  # a depth point further from every annotated vertex is background
 
 
-def recognises(path: Path) -> bool:
+def recognizes(path: Path) -> bool:
     """Whether this is a folder with an annotated mesh, a mesh or a sequence of 3RScan."""
     if not path.is_dir():
         return path.name in ANNOTATED and path.is_file()
     return any((path / name).is_file() for name in (*ANNOTATED, *LABELS, *MESHES, "sequence.zip"))
 
 
-def read(path: Path, options: ReadOptions) -> LabelledCloud:
+def read(path: Path, options: ReadOptions) -> LabeledCloud:
     """Vertices of the annotated mesh, or with `depth_frames` back-projected depth that takes their instances.
 
     Instances keep the dataset's ids, which name the same object in every scan of a place. Raises ValueError,
@@ -69,7 +69,7 @@ def read(path: Path, options: ReadOptions) -> LabelledCloud:
         found, sensors, lost = depth_points(open_sequence(folder))
         instance = nearest_instance(cloud.points, instance, found)
         points, skipped = found, (*skipped, *lost)
-    return LabelledCloud(
+    return LabeledCloud(
         points=points,
         instance=None if options.masks else instance,
         labels=labels,
@@ -104,15 +104,15 @@ def _labels(
     return labels, tuple(Skipped(what=f"instance {i} ({labels[i]})", reason="no vertices") for i in empty), ()
 
 
-def _without_masks(folder: Path, options: ReadOptions) -> LabelledCloud:
+def _without_masks(folder: Path, options: ReadOptions) -> LabeledCloud:
     """A scan of the hidden test set, or one of which only the raw data were fetched."""
     if options.depth_frames:
         points, sensors, lost = depth_points(open_sequence(folder))
-        return LabelledCloud(points=points, instance=None, skipped=lost, unit="m", sensors=sensors)
+        return LabeledCloud(points=points, instance=None, skipped=lost, unit="m", sensors=sensors)
     mesh = _first(folder, MESHES)
     if mesh is None:
         raise ValueError(f"{folder}: no {ANNOTATED[0]} and no {MESHES[0]}; needed one of them")
-    return LabelledCloud(points=read_obj_vertices(mesh), instance=None, unit="m")
+    return LabeledCloud(points=read_obj_vertices(mesh), instance=None, unit="m")
 
 
 def read_obj_vertices(path: Path) -> Float[np.ndarray, "n 3"]:

@@ -44,7 +44,7 @@ def plain(root: Path) -> None:
     for i in (1, 2):
         write_ply(folder / f"chair_{i}.ply", vertex_columns(POINTS[i == IDS]), text=i == 1)
     case(folder, folder)
-    folder = root / "npz" / "labelled"
+    folder = root / "npz" / "labeled"
     folder.mkdir(parents=True)
     labels = np.array(["floor", "chair", "table"])[IDS]
     np.savez(folder / "room.npz", points=POINTS, instance=IDS, label=labels, color=RGB)
@@ -58,7 +58,7 @@ def surveys(root: Path) -> None:
         fields = {axis: POINTS[:, i].astype(np.float32) for i, axis in enumerate("xyz")} | {"instance": IDS}
         case(folder, write_pcd(folder / "room.pcd", fields, encoding))
     for suffix in ("las", "laz"):
-        folder = root / suffix / "colours"
+        folder = root / suffix / "colors"
         folder.mkdir(parents=True)
         case(folder, write_las(folder / f"room.{suffix}", POINTS, RGB.astype(np.uint16) * 257, instance=IDS))
     folder = root / "e57" / "two_scans"

@@ -1,4 +1,4 @@
-"""E57 files of several posed scans, with optional colours and invalid points."""
+"""E57 files of several posed scans, with optional colors and invalid points."""
 
 from pathlib import Path
 

@@ -6,7 +6,7 @@ import numpy as np
 
 
 def write_s3dis(room: Path, objects: dict[str, tuple[np.ndarray, np.ndarray]]) -> Path:
-    """`objects`: `chair_1` → points and colours. Also the room's own file and what the archives carry along."""
+    """`objects`: `chair_1` → points and colors. Also the room's own file and what the archives carry along."""
     folder = room / "Annotations"
     folder.mkdir(parents=True)
     text = {name: s3dis_lines(*object_) for name, object_ in objects.items()}

@@ -1,4 +1,4 @@
-"""Parametric furniture of the kinds that rooms have: metres, z up, standing on z = 0, its front towards -y.
+"""Parametric furniture of the kinds that rooms have: meters, z up, standing on z = 0, its front toward -y.
 
 A piece depends on its category and seed alone. It is one closed connected solid: the boolean union of parts
 that reach into each other.
@@ -100,7 +100,7 @@ def procedural_mesh(category: str, seed: int) -> SourceMesh:
         vertices=standing(np.array(mesh.vert_properties[:, :3], np.float64)),
         faces=np.array(mesh.tri_verts, np.int64),
         source="procedural",
-        licence="MIT; this project's own",
+        license="MIT; this project's own",
     )
 
 

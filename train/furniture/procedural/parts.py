@@ -1,6 +1,6 @@
 """Closed solids that furniture is made of: boards, posts, tubes, turned and lofted parts, cushions.
 
-Lengths are metres, z is up; `at` is the middle of a part's underside unless it says otherwise. Parts that are
+Lengths are meters, z is up; `at` is the middle of a part's underside unless it says otherwise. Parts that are
 to become one piece overlap by `BITE`.
 """
 
@@ -133,18 +133,18 @@ def slab(outline: Outline, thickness: float, at: Point = (0, 0, 0), bevel: float
 
 
 def loft(sections: Sequence[Float[np.ndarray, "n 3"]]) -> Manifold:
-    """A solid through convex sections in order: the union of the hulls of neighbours."""
+    """A solid through convex sections in order: the union of the hulls of neighbors."""
     hull = kernel().Manifold.hull_points
     return union([hull(np.concatenate(pair)) for pair in itertools.pairwise(sections)])
 
 
 def sheared(solid: Manifold, lean: float, above: float) -> Manifold:
-    """Leans backwards (towards +y) by `lean` metres a metre above the height `above`."""
+    """Leans backwards (toward +y) by `lean` meters a meter above the height `above`."""
     return solid.transform(np.array([[1, 0, 0, 0], [0, 1, lean, -lean * above], [0, 0, 1, 0]], float))
 
 
 def curved(solid: Manifold, bow: float, width: float, edge: float = 0.045) -> Manifold:
-    """Bows a part that is wide along x: its middle moves towards +y by `bow`, its ends stay."""
+    """Bows a part that is wide along x: its middle moves toward +y by `bow`, its ends stay."""
 
     def bend(points: np.ndarray) -> np.ndarray:
         shift = bow * (1 - (2 * points[:, :1] / width) ** 2)

@@ -44,7 +44,7 @@ def _seat(rng: Rng, x: float, y: float, top: float) -> tuple[list[Manifold], flo
 
 
 def _narrowed(outline: Outline, share: float) -> Outline:
-    """Narrower towards the back (+y), by that share at the rear edge."""
+    """Narrower toward the back (+y), by that share at the rear edge."""
     depth = (outline[:, 1] - outline[:, 1].min()) / np.ptp(outline[:, 1])
     return outline * np.column_stack([1 - share * depth, np.ones(len(depth))])
 

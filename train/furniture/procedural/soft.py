@@ -171,7 +171,7 @@ def _tub(rng: Rng, x: float, seat: float) -> list[Manifold]:
     hollow = slab(superellipse(x - 2 * wall, y - 2 * wall, squareness), 1.0, (0, 0, seat - 0.1))
     mouth = box(x - 2 * wall, y, 1.0, (0, -y / 2, seat - 0.1))
     shell = outer - hollow - mouth
-    if rng.random() < 0.7:  # arms that fall towards the front
+    if rng.random() < 0.7:  # arms that fall toward the front
         fall = rng.uniform(0.15, 0.45)
         shell = shell.trim_by_plane((0, fall, -1), -tall + 0.1 * y * fall)
     pad = cushion(x - 2 * wall + 0.04, y - wall, 0.17, (0, -wall / 2, seat - 0.13), 2 + squareness, 4, 0, 40)

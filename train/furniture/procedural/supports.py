@@ -1,6 +1,6 @@
 """What furniture stands on: four legs of many styles, sleds, trestles, panels, pedestals, stars on castors.
 
-Each is centred under a plan of x × y, stands on z = 0 and reaches `BITE` above `height`.
+Each is centerd under a plan of x × y, stands on z = 0 and reaches `BITE` above `height`.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ def _turning(rng: Rng, tall: float, radius: float) -> list[tuple[float, float]]:
 
 
 def _rungs(rng: Rng, feet: list[Point], heads: list[Point], radius: float) -> list[Manifold]:
-    """Bars between neighbouring legs: an H, or all around at two heights."""
+    """Bars between neighboring legs: an H, or all around at two heights."""
     radius = max(radius, 0.007)
 
     def on_leg(k: int, share: float) -> Point:

@@ -135,7 +135,7 @@ def desk(rng: Rng) -> list[Manifold]:
 
 
 def _return(rng: Rng, x: float, y: float, top: float, thick: float) -> list[Manifold]:
-    """The wing of an L-shaped desk, towards the front on one side, on a panel."""
+    """The wing of an L-shaped desk, toward the front on one side, on a panel."""
     a, wide, long = int(rng.choice([-1, 1])), rng.uniform(0.4, 0.55), rng.uniform(0.4, 0.9)
     across, front = a * (x / 2 - wide / 2), -y / 2 - long
     wing = box(wide, long + 0.05, thick, (across, front + (long + 0.05) / 2, top - thick))

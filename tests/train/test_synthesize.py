@@ -14,7 +14,7 @@ import trimesh
 from places import ROOT
 
 from more2_jax.scans.read_scan import read_scan
-from train import synthesise
+from train import synthesize
 from train.furniture.closed_models import closed_model, make_cached, read_models
 from train.furniture.collections import SourceMesh, write_packed
 from train.rooms.cameras import SPARSE
@@ -29,7 +29,7 @@ def box(name: str, category: str, extents: tuple[float, float, float]) -> Source
     back.apply_translation((0, extents[1] / 2 - 0.025, extents[2] / 2 + 0.24))
     both = trimesh.util.concatenate([mesh, back])
     return SourceMesh(
-        name=name, category=category, vertices=both.vertices, faces=both.faces, source="boxes", licence="CC0"
+        name=name, category=category, vertices=both.vertices, faces=both.faces, source="boxes", license="CC0"
     )
 
 
@@ -48,10 +48,10 @@ def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def models(source: Path, tmp_path_factory: pytest.TempPathFactory) -> synthesise.Job:
+def models(source: Path, tmp_path_factory: pytest.TempPathFactory) -> synthesize.Job:
     """A job whose models are closed, for scenes made in this process."""
     folder = tmp_path_factory.mktemp("job")
-    job = synthesise.Job(
+    job = synthesize.Job(
         meshes=tuple(read_models(source)),
         cache=folder / "models",
         out=folder / "sparse",
@@ -66,14 +66,14 @@ def models(source: Path, tmp_path_factory: pytest.TempPathFactory) -> synthesise
     return job
 
 
-def make(job: synthesise.Job, folder: Path, regime: str, *, free: bool = False, number: int = 0) -> Path:
+def make(job: synthesize.Job, folder: Path, regime: str, *, free: bool = False, number: int = 0) -> Path:
     one = dataclasses.replace(
-        job, out=folder / f"{regime}{free}", regime=synthesise._regime(regime), free=free, scans=4
+        job, out=folder / f"{regime}{free}", regime=synthesize._regime(regime), free=free, scans=4
     )
-    synthesise.claim(one)
-    synthesise._start(one)
-    synthesise._usable.cache_clear()
-    synthesise.make_scene(number)
+    synthesize.claim(one)
+    synthesize._start(one)
+    synthesize._usable.cache_clear()
+    synthesize.make_scene(number)
     return one.out / f"scene_{number:04d}"
 
 
@@ -208,7 +208,7 @@ def test_a_scene_depends_on_seed_and_number_alone(models, tmp_path):
 
 
 def command(source: Path, out: Path, *more: str, regime: str = "changes") -> subprocess.CompletedProcess[str]:
-    line = f"-m train.synthesise --source {source} --regime {regime} --scenes 2 --scans 3 --out {out}"
+    line = f"-m train.synthesize --source {source} --regime {regime} --scenes 2 --scans 3 --out {out}"
     return subprocess.run(
         [sys.executable, *line.split(), *more], cwd=ROOT, capture_output=True, text=True, check=False
     )
@@ -230,7 +230,7 @@ def test_any_number_of_workers_gives_the_same_and_a_stopped_run_resumes(source, 
     assert json.loads((tmp_path / "one" / "index.json").read_text()) == index
     assert kept.stat().st_mtime_ns == before
     assert [s.name for s in read_benchmark(tmp_path / "one")] == ["scene_0000", "scene_0001"]
-    assert "Licence: CC0" in (tmp_path / "one" / "LICENSES.md").read_text()
+    assert "License: CC0" in (tmp_path / "one" / "LICENSES.md").read_text()
     other = command(source, tmp_path / "one", "--seed", "1")
     assert (other.returncode, other.stderr.count("\n")) == (2, 1)
 
@@ -239,7 +239,7 @@ def test_bad_input_is_one_line(source, tmp_path):
     def refusal(**settings) -> str:
         given = {"source": source, "regime": "paper", "out": tmp_path / "x", "scenes": 1} | settings
         with pytest.raises(ValueError) as raised:
-            synthesise.main(synthesise.Settings(**given))
+            synthesize.main(synthesize.Settings(**given))
         assert "\n" not in str(raised.value)
         return str(raised.value)
 
@@ -266,14 +266,14 @@ def test_models_that_cannot_be_used_are_told_with_the_reason(tmp_path):
     assert make_cached(huge, tmp_path) == make_cached(huge, tmp_path)
 
 
-def test_units_axes_and_licences_of_a_source(source):
+def test_units_axes_and_licenses_of_a_source(source):
     plain = read_models(source)
-    turned = read_models(source, up="y", longest_m=2.0, licence="CC-BY-4.0")
+    turned = read_models(source, up="y", longest_m=2.0, license="CC-BY-4.0")
     for a, b in zip(plain, turned, strict=True):
         assert np.ptp(b.vertices, axis=0).max() == pytest.approx(2.0)
         scale = 2.0 / np.ptp(a.vertices, axis=0).max()
         np.testing.assert_allclose(np.ptp(b.vertices, axis=0), scale * np.ptp(a.vertices, axis=0)[[0, 2, 1]])
-        assert b.licence == "CC0"  # the source's own word counts
+        assert b.license == "CC0"  # the source's own word counts
     with pytest.raises(ValueError, match="category 'shelf'; needed one of seat"):
         read_models(source, longest_m={"seat": 1.0})
 

@@ -1,6 +1,6 @@
 """Meshes to scenes of the open FlyingShape benchmark (METHOD 7).
 
-`python -m train.synthesise --source MESHES --regime paper --scenes 100 --seed 0 --out data/flying_paper`
+`python -m train.synthesize --source MESHES --regime paper --scenes 100 --seed 0 --out data/flying_paper`
 
 Scene number i depends on the meshes, the seed and i alone. Finished scenes are kept: a stopped run resumes.
 """
@@ -56,8 +56,8 @@ class Settings:
     up: Literal["y", "z"] = "z"
     """The source's vertical axis (heldout_ikea.npz is known)."""
     longest_m: float | None = None
-    """Scales every mesh to this longest edge; without it the source is in metres."""
-    licence: str | None = None
+    """Scales every mesh to this longest edge; without it the source is in meters."""
+    license: str | None = None
     """Of meshes that come without one."""
     attribution: str | None = None
     """Who is to be named, for LICENSES.md."""
@@ -78,7 +78,7 @@ def main(settings: Annotated[Settings, tyro.conf.arg(name="")]) -> None:
             f"{s.scenes} scenes, seed {s.seed}, room {s.room_m}; needed positive numbers, seed from 0"
         )
     unreadable: dict[str, str] = {}
-    meshes = read_models(s.source, up=s.up, longest_m=s.longest_m, licence=s.licence, unreadable=unreadable)
+    meshes = read_models(s.source, up=s.up, longest_m=s.longest_m, license=s.license, unreadable=unreadable)
     job = Job(
         meshes=tuple(meshes),
         cache=s.cache or s.out / "models",
@@ -95,7 +95,7 @@ def main(settings: Annotated[Settings, tyro.conf.arg(name="")]) -> None:
         _write(s.out / "report.json", {"rejected": rejected, "unreadable": unreadable})
         digests = make_scenes(job, s.scenes, pool)
     _write(s.out / "index.json", {**job.facts, "scenes": digests})
-    write_licences(s.out, s.attribution)
+    write_licenses(s.out, s.attribution)
     usable = len(meshes) - len(rejected)
     print(f"{s.scenes} scenes of {s.scans} scans from {usable} models, {len(rejected)} rejected, in {s.out}")
 
@@ -223,19 +223,21 @@ def usable_models(job: Job) -> tuple[list[SourceMesh], dict[str, int]]:
     return _usable(id(job))
 
 
-def write_licences(out: Path, attribution: str | None) -> None:
-    """LICENSES.md: the models that the scenes show, by source and licence."""
+def write_licenses(out: Path, attribution: str | None) -> None:
+    """LICENSES.md: the models that the scenes show, by source and license."""
     used: dict[tuple[str, str], set[str]] = {}
     for path in sorted(out.glob("scene_*/scene.json")):
         for o in json.loads(path.read_text())["objects"]:
-            used.setdefault((o["source"], o["licence"]), set()).add(o["model"].split("~")[0])
+            used.setdefault((o["source"], o.get("license", o.get("licence"))), set()).add(
+                o["model"].split("~")[0]
+            )
     lines = ["# Models in these scenes", ""]
     lines += [f"Attribution: {attribution}", ""] if attribution else []
-    for (source, licence), models in sorted(used.items()):
+    for (source, license), models in sorted(used.items()):
         lines += [
             f"## {source}",
             "",
-            f"Licence: {licence}. Closed, and scaled to metres where it came without",
+            f"License: {license}. Closed, and scaled to meters where it came without",
         ]
         lines += ["a unit; in regime `identical` also slightly rescaled.", ""]
         lines += [f"- {m}" for m in sorted(models)] + [""]
