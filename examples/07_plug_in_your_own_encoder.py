@@ -23,12 +23,12 @@ CHANNELS = prior.config.encoder.code  # as wide as the decoder of the prior expe
 def own_embedding(points: np.ndarray, origin: np.ndarray) -> m2.Embedding:
     """Principal axes as `eqv`, their lengths and a histogram of radii as `inv`; points (n, 3) in meters."""
     center = points.mean(axis=0)
-    centerd = points - center
-    variance, axes = np.linalg.eigh(np.cov(centerd.T))
+    centered = points - center
+    variance, axes = np.linalg.eigh(np.cov(centered.T))
     # Axes have no direction of their own: they point to the side where the points reach farther.
-    axes = axes * np.sign(((centerd @ axes) ** 3).sum(axis=0))
+    axes = axes * np.sign(((centered @ axes) ** 3).sum(axis=0))
     axes[:, 2] *= np.linalg.det(axes)
-    radius = np.linalg.norm(centerd, axis=1)
+    radius = np.linalg.norm(centered, axis=1)
     histogram = np.histogram(radius / radius.max(), bins=16, range=(0, 1), density=True)[0] / 4
     inv, eqv = np.zeros(CHANNELS, np.float32), np.zeros((3, CHANNELS), np.float32)
     inv[:19] = np.concatenate([3 * np.sqrt(variance / variance.sum()), histogram])

@@ -18,6 +18,8 @@ _HOMES = {
         "Instance",
         "Scan",
         "LivingScene",
+        "LocalBatch",
+        "ObservedObject",
     ),
     "config": ("SceneConfig", "load_config", "preset"),
     "network.prior": ("Prior", "encode", "init_prior", "load_prior", "save_prior", "sdf"),
@@ -25,7 +27,7 @@ _HOMES = {
     "geometry.points": ("chamfer_distance", "kabsch"),
     "matching.code_assignment": ("match_instances",),
     "registration.register": ("register",),
-    "geometry.poses": ("world_pose",),
+    "registration.pair_batch": ("PairBatch", "batch_of", "local_batch", "pair_up"),
     "meshing.extract": ("extract_mesh",),
     "refinement.joint": ("fit_jointly",),
     "scene": ("add_scan", "reconstruct", "start_scene"),
@@ -38,11 +40,11 @@ if TYPE_CHECKING:
     from more2_jax.config import SceneConfig, load_config, preset
     from more2_jax.geometry.padding import pad_clouds
     from more2_jax.geometry.points import chamfer_distance, kabsch
-    from more2_jax.geometry.poses import world_pose
     from more2_jax.matching.code_assignment import match_instances
     from more2_jax.meshing.extract import extract_mesh
     from more2_jax.network.prior import Prior, encode, init_prior, load_prior, save_prior, sdf
     from more2_jax.refinement.joint import fit_jointly
+    from more2_jax.registration.pair_batch import PairBatch, batch_of, local_batch, pair_up
     from more2_jax.registration.register import register
     from more2_jax.scans.read_scan import read_scan
     from more2_jax.scene import add_scan, reconstruct, start_scene
@@ -51,8 +53,10 @@ if TYPE_CHECKING:
         Embedding,
         Instance,
         LivingScene,
+        LocalBatch,
         Matches,
         Mesh,
+        ObservedObject,
         PointCloud,
         Registration,
         Scan,
@@ -62,14 +66,18 @@ __all__ = [
     "Embedding",
     "Instance",
     "LivingScene",
+    "LocalBatch",
     "Matches",
     "Mesh",
+    "ObservedObject",
+    "PairBatch",
     "PointCloud",
     "Prior",
     "Registration",
     "Scan",
     "SceneConfig",
     "add_scan",
+    "batch_of",
     "chamfer_distance",
     "encode",
     "extract_mesh",
@@ -79,8 +87,10 @@ __all__ = [
     "load_config",
     "load_prior",
     "load_scene",
+    "local_batch",
     "match_instances",
     "pad_clouds",
+    "pair_up",
     "preset",
     "read_scan",
     "reconstruct",
@@ -89,7 +99,6 @@ __all__ = [
     "save_scene",
     "sdf",
     "start_scene",
-    "world_pose",
 ]
 
 

@@ -57,32 +57,58 @@ class PriorConfig:
 
 
 @dataclass(frozen=True)
-class MatchingConfig:
-    """Instance matching (METHOD 3)."""
+class SurfaceSearch:
+    """How a pair's poses are searched: every start aligned by coarse surfaces, the few that fit best kept.
 
-    score: Literal["inv", "eqv", "both"] = "both"  # Λ, 1/E, Λ ⊘ E
-    assignment: Literal["hungarian", "greedy"] = "hungarian"
-    size_weight: float = 0.0  # how much of a mismatch in metric size is held against a pair
-    max_size_ratio: float = 0.0  # 0: any
-    motion_weight: float = 0.0  # a meter moved costs this much score: decides among identical objects
-    # Beyond the paper: surfaces decide, pairs less likely one object than two are none, the score is in log odds.
-    verify: bool = False
-    candidates: int = 8  # partners of every object, and of every instance, that are tried
+    Lengths are shares of the target cloud's radius unless a name says otherwise. docs/relocalisation.md has what
+    each is worth.
+    """
+
+    turns: int = (
+        24  # starts about the vertical, upright; in any orientation the 60 rotations of an icosahedron
+    )
+    points: int = 128  # of either cloud, compared with
+    dense: int = 1024  # so many of the other, found by a table
+    cells: int = 24  # a side of that table
+    steps: int = 12
+    first_reach: float = 0.3  # correspondences this far apart count a quarter, in the first step
+    last_reach: float = 0.1  # and in the last
+    keep: int = 6  # poses, each turned otherwise
+    truncation: float = 0.2  # a point farther from the other cloud counts as this far
+    lift_weight: float = 0.1  # upright: cost of a pose that changes the object's height
+    free_weight: float = 1.0  # upright: cost of lying where the other scan's sensors looked through, if known
+    field_weight: float = 2.0  # cost of lying off the surface that the prior completes the other cloud to
 
 
 @dataclass(frozen=True)
-class RegistrationConfig:
-    """Registration of a matched pair (METHOD 4); the defaults are the paper's."""
+class CodeMatcher:
+    """Matching by the embeddings alone (paper §3.2)."""
 
+    method: Literal["codes"] = "codes"
+    score: Literal["inv", "eqv", "both"] = "both"  # Λ, 1/E, Λ ⊘ E
+    assignment: Literal["hungarian", "greedy"] = "hungarian"
+
+
+@dataclass(frozen=True)
+class EvidenceMatcher:
+    """Matching by surfaces: the embeddings propose pairs, how well a pair's surfaces fit decides (beyond the paper)."""
+
+    method: Literal["evidence"] = "evidence"
+    candidates: int = 8  # partners of every object, and of every instance, that are aligned; 0: all
+    size_weight: float = (
+        0.5  # of |log| of the ratio of the F_s, against the cosine of the F_inv, in what is proposed
+    )
+    motion_weight: float = 0.2  # log odds that a meter moved costs: decides among identical objects
+    search: SurfaceSearch = field(default_factory=SurfaceSearch)
+
+
+@dataclass(frozen=True)
+class DescentRegistration:
+    """Registration by descent on the signed distance field, then ICP (paper §3.3)."""
+
+    method: Literal["descent"] = "descent"
     points: int = 1024  # of the farthest-point samples
     sdf_points: int = 1024  # of them, how many are asked of the field
-    dense: bool = False  # ICP and residual compare a sample with all of the other cloud
-    starts: Literal["embedding", "many"] = "embedding"
-    identity_start: bool = False  # also try "it did not move", for scans in one frame
-    yaw_starts: int = 0  # turns about the vertical, when upright
-    coarse_points: int = 128
-    coarse_steps: int = 12  # trimmed ICP on every start
-    keep_starts: int = 1  # how many of the starts are refined
     steps: int = 200  # Adam on SE(3)
     learning_rate: float = 1e-3  # radians, and shares of the target's radius
     sdf_weight: float = 1.0
@@ -90,23 +116,37 @@ class RegistrationConfig:
     icp_steps: int = 30
     trim: float = 1.0  # share of nearest distances that counts
     converged_rms: float = 0.05  # share of the target's radius
-    refine: Literal["descent", "surface"] = "descent"  # Adam on the loss and ICP, or point-to-plane both ways
-    coarse_dense: int = 1024  # of a cloud, what the `coarse_points` of another are compared with, by a table
-    cells: int = 24  # a side, of the table of nearest points
-    surface_points: int = 256  # of each cloud, compared with all of the other
-    surface_steps: int = 15
-    search_reach: float = 0.3  # of a correspondence, shares of the target's radius: of every start at first,
-    first_reach: float = 0.1  # of the starts that are kept,
-    last_reach: float = 0.03  # and in the end
-    lift_weight: float = 0.0  # of a pose that changes an upright object's height, where scans share a frame
+
+
+@dataclass(frozen=True)
+class SurfaceRegistration:
+    """Registration by point-to-plane alignment of both surfaces (beyond the paper); lengths in shares of the radius.
+
+    Refines the poses that matching found, or those of `search` where it is given none.
+    """
+
+    method: Literal["surface"] = "surface"
+    search: SurfaceSearch = field(default_factory=SurfaceSearch)
+    try_stayed: bool = True  # also "it did not move", which is chosen if it fits nearly as well as the best
+    points: int = 256  # of each cloud, compared with all of the other
+    steps: int = 15
+    first_reach: float = 0.1  # of a correspondence, in the first step
+    last_reach: float = 0.03  # and in the last
+    choose_among: int = (
+        3  # refined poses, each turned otherwise, that the prior tells apart; and "it did not move"
+    )
+    field_points: int = 1024  # of each cloud, asked of the other's completed surface
     polish_points: int = 512  # then, for the best pose alone
     polish_steps: int = 10
     polish_reach: float = 0.02
-    field_weight: float = 0.0  # of both clouds' distance from the other's field, in the choice among poses
-    free_weight: float = (
-        0.0  # of both clouds' share in space that the other's sensors looked through, if known
-    )
-    truncation: float = 0.1  # a point farther than this from the other cloud counts as this far
+    trim: float = 0.7  # share of nearest distances that counts in the residual
+    converged_rms: float = 0.05
+
+
+Matcher = CodeMatcher | EvidenceMatcher
+RegistrationMethod = DescentRegistration | SurfaceRegistration
+# How objects move between scans: any rigid motion, or shifts and turns about the vertical (z) only.
+MotionModel = Literal["free", "upright"]
 
 
 @dataclass(frozen=True)
@@ -174,11 +214,16 @@ class SceneConfig:
         False  # match and register against all seen so far, not the reference observation
     )
     accumulate_misfit: float = 1.0  # an observation whose registration fits worse is left out of the shape
-    matching: MatchingConfig = field(default_factory=MatchingConfig)
-    registration: RegistrationConfig = field(default_factory=RegistrationConfig)
+    matching: Matcher = field(default_factory=CodeMatcher)
+    registration: RegistrationMethod = field(default_factory=DescentRegistration)
     closing: ClosingConfig = field(default_factory=ClosingConfig)
     joint: JointConfig = field(default_factory=JointConfig)
     meshing: MeshingConfig = field(default_factory=MeshingConfig)
+
+    @property
+    def motion(self) -> MotionModel:
+        """How objects may move."""
+        return "upright" if self.upright else "free"
 
 
 @dataclass(frozen=True)
@@ -254,22 +299,8 @@ def preset(name: str, *, upright: bool = False) -> SceneConfig:
             upright=upright,
             accumulate_target=True,
             accumulate_misfit=0.5,
-            matching=MatchingConfig(score="inv", size_weight=0.5, motion_weight=0.2, verify=True),
-            registration=RegistrationConfig(
-                points=256,
-                sdf_points=1024,
-                dense=True,
-                starts="many",
-                identity_start=True,
-                yaw_starts=24 if upright else 0,
-                keep_starts=6,
-                trim=0.7,
-                refine="surface",
-                lift_weight=0.1,
-                truncation=0.2,
-                field_weight=2.0,
-                free_weight=1.0 if upright else 0.0,
-            ),
+            matching=EvidenceMatcher(),
+            registration=SurfaceRegistration(),
             meshing=ROBUST_MESHING,
             closing=ClosingConfig(steps=16),
             # No step: after alignment by surfaces it buys neither poses nor meshes (docs/design_notes.md).
@@ -304,7 +335,9 @@ def from_dict(cls: type[C], values: dict[str, Any], where: str = "") -> C:
 def _convert(hint: Any, value: Any, where: str) -> Any:
     if dataclasses.is_dataclass(hint):
         return from_dict(hint, value, where)  # type: ignore[arg-type]
-    origin = typing.get_origin(hint)
+    origin, inner_types = typing.get_origin(hint), typing.get_args(hint)
+    if origin is types.UnionType and all(map(dataclasses.is_dataclass, inner_types)):
+        return from_dict(_named_method(inner_types, value, where), value, where)
     if origin is Literal:
         if value not in typing.get_args(hint):
             raise ValueError(
@@ -323,6 +356,15 @@ def _convert(hint: Any, value: Any, where: str) -> Any:
     if not isinstance(value, hint) or (hint is int and isinstance(value, bool)):
         raise ValueError(f"{where}: got {value!r}, needed {hint.__name__}")
     return value
+
+
+def _named_method(methods: tuple[Any, ...], values: Any, where: str) -> Any:
+    """The settings class whose `method` the values name."""
+    names = {m.method: m for m in methods}
+    got = values.get("method") if isinstance(values, dict) else values
+    if not isinstance(got, str) or got not in names:
+        raise ValueError(f"{where}.method: got {got!r}, needed one of {', '.join(map(repr, names))}")
+    return names[got]
 
 
 def load_config(path: str | Path, cls: type[C]) -> C:

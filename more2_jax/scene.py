@@ -3,29 +3,32 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from functools import partial
 
 import numpy as np
 from jaxtyping import Float
 
-from more2_jax.config import SceneConfig
-from more2_jax.geometry.poses import apply_pose
+from more2_jax.config import EvidenceMatcher, SceneConfig
+from more2_jax.geometry.poses import Pose, apply_pose
+from more2_jax.matching.color import color_of
 from more2_jax.meshing.object_mesh import floor_of, meshes_of, seen_often
 from more2_jax.network.embedding_batch import embed
 from more2_jax.network.prior import Prior
 from more2_jax.progress import Watcher, staged
 from more2_jax.refinement.joint_of_objects import embed_accumulated, fit_objects
 from more2_jax.refinement.pose_graph_of_objects import close_objects
-from more2_jax.tracking.identify import match_scan, register_in_frame
-from more2_jax.tracking.object_views import few_sensors, instances_with_sight, objects_with_sight
+from more2_jax.tracking.identify import identify
+from more2_jax.tracking.object_views import few_sensors, instance_sights, object_sights
 from more2_jax.tracking.objects import (
     SCENE_FRAME,
     changes_between,
     new_object,
     seen_again,
 )
+from more2_jax.tracking.relocalize import known_object, relocalize
 from more2_jax.tracking.scan_frame import Rooms
-from more2_jax.types import Frame, Instance, LivingScene, Scan, ScanRecord, Skipped
+from more2_jax.types import Embedding, Frame, Instance, LivingScene, ObservedObject, Scan, ScanRecord, Skipped
 
 BACKGROUND_POINTS = 20_000  # of a scan, remembered for the page and for what its sensors looked through
 
@@ -66,30 +69,29 @@ def add_scan(
     stage = partial(staged, timing, progress, scan=scan.name)
     with stage("encode", len(instances)):
         embeddings = embed(prior, [i.points for i in instances])
-    if config.registration.free_weight:
-        instances = instances_with_sight(instances, scan, remembered(scan.background))
-        objects = objects_with_sight(objects, scene.scans)
     with stage("match", len(instances)):
-        identified = match_scan(prior, objects, instances, embeddings, config, rooms_of(scene, scan))
+        old, new = compared_objects(scene, instances, embeddings, scan, config)
+        known = [o for o, _ in old]
+        identified = identify(prior, known, new, config, rooms_of(scene, scan))
     found, chance = identified.found, {objects[k].id: p for k, p in identified.gone.items()}
     with stage("register", len(found), unit="pairs"):
-        seen, frame = register_in_frame(prior, objects, instances, embeddings, identified, index, config)
+        seen, frame = relocalize(prior, objects, old, instances, new, identified, index, config)
     for f, observation in zip(found, seen, strict=True):
         objects[f.object] = seen_again(objects[f.object], instances[f.instance], observation)
-        if config.matching.verify:
+        if isinstance(config.matching, EvidenceMatcher):
             chance[objects[f.object].id] = f.score  # that what came back is what it was
     if config.accumulate_target:
         with stage("encode", len(found)):
             changed = [f.object for f, s in zip(found, seen, strict=True) if s.accumulated]
             objects = embed_accumulated(prior, objects, changed)
-    known = {f.instance for f in found}
-    for i in (i for i in range(len(instances)) if i not in known):
+    matched = {f.instance for f in found}
+    for i in (i for i in range(len(instances)) if i not in matched):
         objects.append(new_object(len(objects), index, instances[i], embeddings[i], frame))
         chance |= {objects[-1].id: identified.new[i]} if i in identified.new else {}
     return dataclasses.replace(
         scene,
         scans=(*scene.scans, record(index, scan, instances, skipped, frame)),
-        objects=tuple(dataclasses.replace(o, sight=None) for o in objects),
+        objects=tuple(objects),
         changes=(*scene.changes, changes_between(objects, index - 1, index, config, chance)),
         timing_s=timing,
     )
@@ -123,6 +125,24 @@ def reconstruct(
         changes_between(objects, c.from_scan, c.to_scan, config, c.probability) for c in scene.changes
     )
     return dataclasses.replace(scene, objects=tuple(objects), changes=changes, timing_s=timing)
+
+
+def compared_objects(
+    scene: LivingScene,
+    instances: Sequence[Instance],
+    embeddings: Sequence[Embedding],
+    scan: Scan,
+    config: SceneConfig,
+) -> tuple[list[tuple[ObservedObject, Pose]], list[ObservedObject]]:
+    """The scene's objects (scene's frame, each with the pose to its own) and a scan's instances, as stages take them."""
+    of_objects = object_sights(scene.objects, scene.scans)
+    of_instances = instance_sights(instances, scan, remembered(scan.background))
+    old = [known_object(o, view, config) for o, view in zip(scene.objects, of_objects, strict=True)]
+    new = [
+        ObservedObject(points=i.points, embedding=e, color=color_of(i.colors), sight=view)
+        for i, e, view in zip(instances, embeddings, of_instances, strict=True)
+    ]
+    return old, new
 
 
 def usable(scan: Scan, config: SceneConfig) -> tuple[list[Instance], tuple[Skipped, ...]]:

@@ -2,22 +2,48 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import dataclasses
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import TypeVar, dataclass_transform
+from typing import Any, Literal, TypeVar, dataclass_transform
 
 import flax.struct
+import jax
 import jaxlie
 import numpy as np
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
-from more2_jax.geometry.poses import Points
-
 T = TypeVar("T")
 
+# How a quantity of a record changes when the record is moved by T = (R, t) or rescaled by s (`geometry.transform`):
+# "position" s·x, R x + t · "offset" (between positions) s·x, R x · "direction" x, R x · "columns" (directions in
+# columns) x, R x · "length" s·x, x · "pose" (between the record's frames) rescaled only · "covariance" (of shift and
+# turn) rescaled only · "axis-aligned" s·x, cannot be turned · "origin" of the record's positions · "record" as its own
+# quantities do · "invariant" neither.
+Quantity = Literal[
+    "position",
+    "offset",
+    "direction",
+    "columns",
+    "length",
+    "pose",
+    "covariance",
+    "axis-aligned",
+    "origin",
+    "record",
+    "invariant",
+]
 
-@dataclass_transform(frozen_default=True, kw_only_default=True)
+
+def quantity(kind: Quantity, **options: Any) -> Any:
+    """A field of a record that says how it changes when the record is moved or rescaled."""
+    return flax.struct.field(metadata={"quantity": kind}, **options)
+
+
+@dataclass_transform(
+    frozen_default=True, kw_only_default=True, field_specifiers=(quantity, flax.struct.field)
+)
 def pytree(cls: type[T]) -> type[T]:
     """Makes `cls` a frozen, keyword-only dataclass that JAX maps over."""
     decorate: Callable[[type[T]], type[T]] = flax.struct.dataclass
@@ -32,44 +58,83 @@ class PointCloud:
     """A padded point cloud; rows where `mask` is False carry no meaning.
 
     `points` are meters relative to `origin`, which stays float64 on the host: an object surveyed a
-    kilometer from the world's zero keeps its micrometers in float32.
+    kilometer from the world's zero keeps its micrometers in float32. Inside compiled programs it is None.
     """
 
-    points: Float[Array, "*batch n 3"]  # meters, relative to `origin`
-    mask: Bool[Array, "*batch n"]  # True where the point is real
-    origin: Float[Array | np.ndarray, "*batch 3"]  # meters, in the scan's frame
+    points: Float[Array, "*batch n 3"] = quantity("position")  # meters, relative to `origin`
+    mask: Bool[Array, "*batch n"] = quantity("invariant")  # True where the point is real
+    origin: Float[Array | np.ndarray, "*batch 3"] | None = quantity(
+        "origin", default=None
+    )  # in the scan's frame
 
 
 @pytree
 class Anchors:
     """Points of the observed surface with the encoder's features there: what a local decoder looks up."""
 
-    offset: Float[Array, "*batch a 3"]  # meters, relative to the embedding's `center`
-    features: Float[Array, "*batch a 3 f"]  # unit norm over (3, f); columns turn with the object
-    mask: Bool[Array, "*batch a"]  # True where the anchor is real
+    offset: Float[Array, "*batch a 3"] = quantity("offset")  # meters, relative to the embedding's `center`
+    features: Float[Array, "*batch a 3 f"] = quantity("columns")  # unit norm over (3, f)
+    mask: Bool[Array, "*batch a"] = quantity("invariant")  # True where the anchor is real
 
 
 @pytree
 class Sight:
-    """What sensors at known places saw around one object: depth images that say how far space is free (`sight.py`)."""
+    """What sensors at known places saw around one object: depth images that say how far space is free
+    (`geometry.free_space`); in the object's frame, meters."""
 
-    eye: Float[Array | np.ndarray, "*batch v 3"]  # where each stood, in the object's frame, meters
-    turn: Float[Array | np.ndarray, "*batch v 3 3"]  # rows: across, down its image, and forward
-    half: Float[Array | np.ndarray, "*batch v"]  # tangent of half the angle that the image spans
-    side: Float[Array | np.ndarray, "*batch v"]  # pixels of a row, the first ones of `clear`
-    clear: Float[Array | np.ndarray, "*batch v p p"]  # meters that are free along a pixel's ray; 0: not known
+    eye: Float[Array | np.ndarray, "*batch v 3"] = quantity("position")  # where each stood
+    turn: Float[Array | np.ndarray, "*batch v 3 3"] = quantity(
+        "direction"
+    )  # rows: across, down its image, forward
+    half: Float[Array | np.ndarray, "*batch v"] = quantity(
+        "invariant"
+    )  # tangent of half the angle of the image
+    side: Float[Array | np.ndarray, "*batch v"] = quantity(
+        "invariant"
+    )  # pixels of a row, the first of `clear`
+    clear: Float[Array | np.ndarray, "*batch v p p"] = quantity(
+        "length"
+    )  # free along a pixel's ray; 0: not known
 
 
 @pytree
 class Embedding:
     """What the encoder says of one object (paper §3.1): `Φ(sRX + t) = (inv, R·eqv, s·scale, sR·center + t)`."""
 
-    inv: Float[Array, "*batch c"]  # F_inv, no unit
-    eqv: Float[Array, "*batch 3 c"]  # F_eqv, columns turn with the object
-    scale: Float[Array, "*batch"]  # F_s, meters per canonical unit
-    center: Float[Array, "*batch 3"]  # F_c, meters, relative to `origin`
-    origin: Float[Array | np.ndarray, "*batch 3"]  # meters, in the scan's frame
-    anchors: tuple[Anchors, ...] = ()  # a level each; none where the decoder reads the four codes alone
+    inv: Float[Array, "*batch c"] = quantity("invariant")  # F_inv, no unit
+    eqv: Float[Array, "*batch 3 c"] = quantity("columns")  # F_eqv
+    scale: Float[Array, "*batch"] = quantity("length")  # F_s, meters per canonical unit
+    center: Float[Array, "*batch 3"] = quantity("position")  # F_c, meters, relative to `origin`
+    # In the scan's frame, meters, float64; None inside compiled programs.
+    origin: Float[Array | np.ndarray, "*batch 3"] | None = quantity("origin", default=None)
+    # A level each; none where the decoder reads the four codes alone.
+    anchors: tuple[Anchors, ...] = quantity("record", default=())
+
+    def scan_center(self) -> Float[np.ndarray, "*batch 3"]:
+        """F_c in the scan's frame, meters, float64. Raises ValueError for a code in a local frame."""
+        if self.origin is None:
+            raise ValueError("a code in a local frame has no place in a scan; needed one with its origin")
+        return np.asarray(self.center, np.float64) + np.asarray(self.origin, np.float64)
+
+
+@pytree
+class LocalBatch:
+    """Objects side by side, each in a local frame about its own `origin`, which stays float64 on the host.
+
+    `cloud` and `code` are relative to `origin` and have none of their own.
+    """
+
+    cloud: PointCloud = quantity("record")
+    code: Embedding = quantity("record")
+    sight: Sight | None = quantity("record", default=None)
+    origin: Float[Array | np.ndarray, "*batch 3"] | None = quantity("origin", default=None)
+
+    def take(self, rows: Sequence[int] | Int[np.ndarray, " k"]) -> LocalBatch:
+        """The objects in `rows`, in that order."""
+        at = np.asarray(rows, int)
+        local = dataclasses.replace(self, origin=None)
+        chosen = jax.tree.map(lambda x: x[at], local)
+        return dataclasses.replace(chosen, origin=None if self.origin is None else self.origin[at])
 
 
 @pytree
@@ -84,26 +149,30 @@ class Matches:
 class Registration:
     """A pose per pair, with its own loss (paper §3.3)."""
 
-    T_target_source: jaxlie.SE3  # source's local frame to target's local frame
-    loss: Float[Array, "*batch"]  # what was minimized, at this very pose
-    rms_m: Float[Array, "*batch"]  # trimmed root mean square of nearest distances, both ways
-    converged: Bool[Array, "*batch"]  # the pose stopped moving and explains both clouds
-    # The rest only where `RegistrationConfig.refine` is "surface".
-    misfit: Float[Array, "*batch"] | None = None  # of the surfaces: 0 none, 1 nothing of both clouds agrees
-    covariance: Float[Array, "*batch 6 6"] | None = (
-        None  # of (shift m, turn rad), about the target's local zero
-    )
-    competing: jaxlie.SE3 | None = None  # (*batch, k): other poses tried to the end
-    competes: Bool[Array, "*batch k"] | None = None  # which explain both clouds as well, turned otherwise
+    T_target_source: jaxlie.SE3 = quantity("pose")  # source's local frame to target's local frame
+    loss: Float[Array, "*batch"] = quantity("invariant")  # what was minimized, at this very pose
+    # Trimmed root mean square of nearest distances, both ways, meters.
+    rms_m: Float[Array, "*batch"] = quantity("length")
+    converged: Bool[Array, "*batch"] = quantity(
+        "invariant"
+    )  # the pose stopped moving and explains both clouds
+    # The rest only of `SurfaceRegistration`.
+    # Of the surfaces: 0 none, 1 nothing of both clouds agrees.
+    misfit: Float[Array, "*batch"] | None = quantity("invariant", default=None)
+    # Of (shift m, turn rad), about the target's local zero.
+    covariance: Float[Array, "*batch 6 6"] | None = quantity("covariance", default=None)
+    competing: jaxlie.SE3 | None = quantity("pose", default=None)  # (*batch, k): other poses tried to the end
+    # Which of them explain both clouds as well, turned otherwise.
+    competes: Bool[Array, "*batch k"] | None = quantity("invariant", default=None)
 
 
 @pytree
 class JointFit:
     """Shape code and poses of one object, optimized together over its observations (paper §3.5)."""
 
-    embedding: Embedding  # in the frame of the reference observation
-    T_ref_obs: jaxlie.SE3  # one a observation
-    loss: Float[Array, "*batch"]
+    embedding: Embedding = quantity("record")  # in the frame of the reference observation
+    T_ref_obs: jaxlie.SE3 = quantity("pose")  # one a observation
+    loss: Float[Array, "*batch"] = quantity("invariant")
 
 
 # --- on the host: what people load, keep and write ----------------------------------------------------------
@@ -133,7 +202,18 @@ class Instance:
     points: Float[np.ndarray, "n 3"]
     label: str | None = None
     colors: Int[np.ndarray, "n 3"] | None = None  # uint8
-    sight: Sight | None = None  # what the scan's sensors saw around it, where that is known and asked for
+
+
+@dataclass(frozen=True, kw_only=True)
+class ObservedObject:
+    """An object as the stages compare it: all that was seen of it, in one frame."""
+
+    points: Float[np.ndarray, "_ 3"] = quantity("position")  # meters, float64
+    embedding: Embedding = quantity("record")  # NumPy leaves, unbatched
+    color: Color | None = quantity("invariant", default=None)
+    sight: Sight | None = quantity(
+        "record", default=None
+    )  # what sensors saw around it, where their places are known
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -206,9 +286,6 @@ class SceneObject:
     embedding: Embedding  # NumPy leaves, unbatched; frame of the reference observation
     mesh: Mesh | None = None
     color: Color | None = None  # of the accumulated observations whose scans have colors
-    sight: Sight | None = (
-        None  # what sensors saw around it, in its frame; made when a scan is added, never kept
-    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -254,13 +331,3 @@ class LivingScene:
     changes: tuple[Changes, ...]
     timing_s: dict[str, float] = field(default_factory=dict)
     unit: str = "m"
-
-
-@dataclass(frozen=True, kw_only=True)
-class ObservedObject:
-    """An object or an instance as it is compared: points and embedding in one scan's frame."""
-
-    points: Points
-    embedding: Embedding
-    color: Color | None = None
-    sight: Sight | None = None

@@ -20,7 +20,7 @@ def bucket(count: int, smallest: int = 1) -> int:
 
 
 def pad_clouds(clouds: Sequence[Float[np.ndarray, "_ 3"]], size: int | None = None) -> PointCloud:
-    """Batches ragged clouds: (objects, bucket, 3), centerd on each cloud's own `origin` (float64).
+    """Batches ragged clouds: (objects, bucket, 3), centered on each cloud's own `origin` (float64).
 
     The point farthest from the mean comes first: farthest-point sampling starts there, so that the order of
     a cloud's points does not matter. Clouds beyond `MAX_POINTS` are thinned evenly by index. `size` sets the
@@ -49,10 +49,10 @@ def _pad(cloud: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray, np.ndarr
     if len(cloud) > size:
         raise ValueError(f"a cloud has {len(cloud)} points; needed at most the bucket's {size}")
     origin = cloud.mean(axis=0)
-    centerd = cloud - origin
-    first = int(np.argmax((centerd**2).sum(axis=1)))
+    centered = cloud - origin
+    first = int(np.argmax((centered**2).sum(axis=1)))
     order = np.r_[first, np.delete(np.arange(len(cloud)), first), np.full(size - len(cloud), first)]
-    return centerd[order].astype(np.float32), np.arange(size) < len(cloud), origin
+    return centered[order].astype(np.float32), np.arange(size) < len(cloud), origin
 
 
 def pad_batch(cloud: PointCloud, count: int) -> PointCloud:

@@ -16,9 +16,10 @@ import jaxlie
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
-from more2_jax.geometry.nearest_grid import NearestGrid, look_up, nearest_grid, scale_grid
+from more2_jax.config import MotionModel
+from more2_jax.geometry.nearest_grid import NearestGrid, look_up, nearest_grid
 from more2_jax.geometry.points import FAR, Sampled, nearest_index, thin, transformed
-from more2_jax.types import pytree
+from more2_jax.types import pytree, quantity
 
 ALONG = 0.02  # weight of sliding along the surface, against leaving it
 DAMPING = 1e-4  # of the normal equations, in shares of their trace: a ball may turn freely
@@ -32,16 +33,12 @@ NEIGHBORHOOD = 2.5  # half width of a normal's neighborhood, in median distances
 class Surface:
     """A cloud with normals, as a sample to compare and in full to be compared with. Normals have no side."""
 
-    sampled: Sampled
-    normals: Float[Array, "*b n 3"]  # of the sample
-    dense_normals: Float[Array, "*b m 3"]
-    grid: NearestGrid | None = None  # names the nearest of `dense`; without it every distance is measured
-
-
-def surface(cloud: Sampled) -> Surface:
-    """The cloud with the normals of its sample and of all of it."""
-    normals_of = normal_estimator(cloud.dense, cloud.dense_mask)
-    return Surface(sampled=cloud, normals=normals_of(cloud.points), dense_normals=normals_of(cloud.dense))
+    sampled: Sampled = quantity("record")
+    normals: Float[Array, "*b n 3"] = quantity("direction")  # of the sample
+    dense_normals: Float[Array, "*b m 3"] = quantity("direction")
+    grid: NearestGrid | None = quantity(
+        "record", default=None
+    )  # names the nearest of `dense`; without it every distance is measured
 
 
 def whole_surface(points: Float[Array, "n 3"], mask: Bool[Array, " n"]) -> Surface:
@@ -68,13 +65,6 @@ def coarsened(s: Surface, count: int, dense: int, cells: int) -> Surface:
     return dataclasses.replace(thinned(fewer, count), grid=nearest_grid(points, real, cells))
 
 
-def scale_surface(s: Surface, factor: Float[Array, ""]) -> Surface:
-    """The surface in other units of length."""
-    sampled = dataclasses.replace(s.sampled, points=s.sampled.points * factor, dense=s.sampled.dense * factor)
-    grid = None if s.grid is None else scale_grid(s.grid, factor)
-    return dataclasses.replace(s, sampled=sampled, grid=grid)
-
-
 def normal_estimator(
     cloud: Float[Array, "m 3"], mask: Bool[Array, " m"]
 ) -> Callable[[Float[Array, "n 3"]], Float[Array, "n 3"]]:
@@ -82,7 +72,7 @@ def normal_estimator(
     width = NEIGHBORHOOD * spacing(cloud, mask)
 
     def normals(points: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
-        # All moments about the cloud's own zero, by one matrix product; the cloud is centerd, so none cancels badly.
+        # All moments about the cloud's own zero, by one matrix product; the cloud is centered, so none cancels badly.
         squared = sum((points[:, None, i] - cloud[None, :, i]) ** 2 for i in range(3))
         weight = jnp.where(mask, jnp.exp(-0.5 * squared / width**2), 0.0)
         weight = weight / jnp.maximum(weight.sum(axis=1, keepdims=True), 1e-30)
@@ -250,38 +240,38 @@ def cross_matrix(v: Float[Array, "3"]) -> Float[Array, "3 3"]:
     return jnp.stack([zero, -v[2], v[1], v[2], zero, -v[0], -v[1], v[0], zero]).reshape(3, 3)
 
 
-def free_directions(upright: bool) -> Float[Array, "6"]:
-    """1 where a pose may change."""
-    return jnp.array(NO_TILT if upright else (1.0,) * 6)
+def free_directions(motion: MotionModel) -> Float[Array, "6"]:
+    """Of (shift, turn), 1 where a pose may change."""
+    return jnp.array(NO_TILT if motion == "upright" else (1.0,) * 6)
 
 
-def solvable(H: Float[Array, "6 6"], upright: bool) -> Float[Array, "6 6"]:
+def solvable(H: Float[Array, "6 6"], motion: MotionModel) -> Float[Array, "6 6"]:
     """The matrix a little damped; `upright`: without tilt."""
     H = H + (DAMPING * jnp.trace(H) / 6 + 1e-9) * jnp.eye(6)
-    free = free_directions(upright)
+    free = free_directions(motion)
     return H * free * free[:, None] + jnp.diag(1 - free)
 
 
 def align_step(
-    T: jaxlie.SE3, source: Surface, target: Surface, reach: Float[Array, ""], upright: bool
+    T: jaxlie.SE3, source: Surface, target: Surface, reach: Float[Array, ""], motion: MotionModel
 ) -> jaxlie.SE3:
     """One Gauss-Newton step; `upright`: shifts, and turns about the vertical only."""
     equations = normal_equations(T, source, target, reach)
-    free = free_directions(upright)
-    step = solve_spd(solvable(equations.matrix, upright), (equations.vector * free)[:, None])[:, 0]
+    free = free_directions(motion)
+    step = solve_spd(solvable(equations.matrix, motion), (equations.vector * free)[:, None])[:, 0]
     return jaxlie.SE3.exp(step) @ T
 
 
 def pose_covariance(
-    T: jaxlie.SE3, source: Surface, target: Surface, reach: float, upright: bool
+    T: jaxlie.SE3, source: Surface, target: Surface, reach: float, motion: MotionModel
 ) -> Float[Array, "6 6"]:
     """Covariance of (shift, turn) at `T` from how well surfaces pin it down; tilt has none when `upright`.
 
     Correspondences are taken as independent: a lower bound, blind to a wrong basin (see `competing`).
     """
     equations = normal_equations(T, source, target, jnp.asarray(reach))
-    free = free_directions(upright)
-    inverse = solve_spd(solvable(equations.matrix, upright), jnp.eye(6)) * free * free[:, None]
+    free = free_directions(motion)
+    inverse = solve_spd(solvable(equations.matrix, motion), jnp.eye(6)) * free * free[:, None]
     return inverse * equations.variance / jnp.maximum(equations.count, 1.0)
 
 
@@ -291,12 +281,12 @@ def align(
     target: Surface,
     reach: tuple[float, float],
     steps: int,
-    upright: bool,
+    motion: MotionModel,
 ) -> jaxlie.SE3:
     """`steps` of `align_step`, the reach falling geometrically from the first to the second value."""
     widths = jnp.geomspace(reach[0], reach[1], steps)
 
     def body(T: jaxlie.SE3, width: Array) -> tuple[jaxlie.SE3, None]:
-        return align_step(T, source, target, width, upright), None
+        return align_step(T, source, target, width, motion), None
 
     return jax.lax.scan(body, T, widths)[0]

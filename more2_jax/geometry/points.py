@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 import jaxlie
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
-from more2_jax.types import pytree
+from more2_jax.geometry.transform import transform
+from more2_jax.types import pytree, quantity
 
 TINY = 1e-30
 FAR = 1e30  # squared distance to a row that is not there: larger than any, yet finite
@@ -49,27 +48,16 @@ class Sampled:
     """A cloud as a farthest-point sample (`points`) and in full (`dense`): sparse points are compared with the
     other's dense ones, so that a residual measures misfit and not the spacing of the samples."""
 
-    points: Float[Array, "*b n 3"]
-    mask: Bool[Array, "*b n"]
-    dense: Float[Array, "*b m 3"]
-    dense_mask: Bool[Array, "*b m"]
+    points: Float[Array, "*b n 3"] = quantity("position")
+    mask: Bool[Array, "*b n"] = quantity("invariant")
+    dense: Float[Array, "*b m 3"] = quantity("position")
+    dense_mask: Bool[Array, "*b m"] = quantity("invariant")
 
 
-def sample(points: Float[Array, "n 3"], mask: Bool[Array, " n"], count: int, dense: bool) -> Sampled:
-    """`count` farthest points of a cloud, beside all of it, or (`dense` False) beside nothing more."""
-    points = jnp.where(mask[:, None], points, 0.0)
+def sample(points: Float[Array, "n 3"], mask: Bool[Array, " n"], count: int) -> Sampled:
+    """`count` farthest points of a cloud, beside nothing more."""
     sparse, sparse_mask = farthest_points(points, mask, count)
-    if dense:
-        return Sampled(points=sparse, mask=sparse_mask, dense=points, dense_mask=mask)
     return Sampled(points=sparse, mask=sparse_mask, dense=sparse, dense_mask=sparse_mask)
-
-
-def evenly(cloud: Sampled, every: int) -> Sampled:
-    """The cloud sampled as densely as it was seen: every so-manieth of its rows, in place of the farthest points.
-
-    Farthest points seek out the outliers; these weigh the surface by what the sensor saw of it.
-    """
-    return dataclasses.replace(cloud, points=cloud.dense[::every], mask=cloud.dense_mask[::every])
 
 
 def thin(mask: Bool[Array, " n"], count: int) -> tuple[Int[Array, " count"], Bool[Array, " count"]]:
@@ -203,16 +191,9 @@ def transformed(T_a_b: jaxlie.SE3, points: Float[Array, "n 3"]) -> Float[Array, 
     return jnp.matmul(points, R.T, precision="highest") + T_a_b.translation()
 
 
-def move(T_a_b: jaxlie.SE3, cloud: Sampled) -> Sampled:
-    """The cloud in frame a."""
-    return dataclasses.replace(
-        cloud, points=transformed(T_a_b, cloud.points), dense=transformed(T_a_b, cloud.dense)
-    )
-
-
 def icp_step(T: jaxlie.SE3, source: Sampled, target: Sampled, share: float) -> jaxlie.SE3:
     """One step of trimmed point-to-point ICP with correspondences both ways; returns the new `T_target_source`."""
-    moved = move(T, source)
+    moved = transform(source, T)
     to_target, d_source = nearest(moved.points, moved.mask, target.dense, target.dense_mask)
     to_source, d_target = nearest(target.points, target.mask, moved.dense, moved.dense_mask)
     a = jnp.concatenate([moved.points, moved.dense[to_source]])

@@ -1,19 +1,14 @@
-"""TODO"""
+"""Poses between frames on the host (float64, 4×4, row-major), and how they compare."""
 
 from __future__ import annotations
 
-import jax.numpy as jnp
 import jaxlie
 import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 Points = Float[np.ndarray, "_ 3"]  # clouds of one call differ in size
-
-
 Matrix3 = Float[np.ndarray, "3 3"]
-
-
 Pose = Float[np.ndarray, "4 4"]
 
 
@@ -27,35 +22,38 @@ def apply_pose(T_a_b: Pose, points: Points) -> Points:
     return points @ T_a_b[:3, :3].T + T_a_b[:3, 3]
 
 
-def world_pose(
-    T_target_source: jaxlie.SE3, target_origin: Float[np.ndarray, "3"], source_origin: Float[np.ndarray, "3"]
-) -> Float[np.ndarray, "4 4"]:
-    """The pose between the scans' own frames, float64 row-major, from a local one."""
-    quaternion = np.asarray(T_target_source.rotation().wxyz, np.float64)
-    rotation = Rotation.from_quat(quaternion, scalar_first=True).as_matrix()
-    pose = np.eye(4)
-    pose[:3, :3] = rotation
-    pose[:3, 3] = (
-        np.asarray(T_target_source.translation(), np.float64) + target_origin - rotation @ source_origin
-    )
-    return pose
-
-
-def in_frames(
-    local: jaxlie.SE3, target_origin: Float[np.ndarray, "p 3"], source_origin: Float[np.ndarray, "p 3"]
-) -> Float[np.ndarray, "p h 4 4"]:
-    """Poses between local frames as poses between the frames of the clouds, float64."""
-    q = np.asarray(local.rotation().wxyz, np.float64)
-    T = np.tile(np.eye(4), (*q.shape[:2], 1, 1))
-    R = Rotation.from_quat(q.reshape(-1, 4), scalar_first=True).as_matrix().reshape(*q.shape[:2], 3, 3)
-    shift = np.asarray(local.translation(), np.float64)
-    T[..., :3, :3] = R
-    T[..., :3, 3] = shift + target_origin[:, None] - np.einsum("phij,pj->phi", R, source_origin)
+def vertical_shift(height_m: float) -> Pose:
+    """A shift along z, meters."""
+    T = np.eye(4)
+    T[2, 3] = height_m
     return T
 
 
-def local_pose(T_ref_scan: Pose, ref_origin: np.ndarray, scan_origin: np.ndarray) -> np.ndarray:
-    """The pose between local frames, as jaxlie's (qw, qx, qy, qz, x, y, z)."""
-    T = T_ref_scan.copy()
-    T[:3, 3] = apply_pose(T_ref_scan, scan_origin[None])[0] - ref_origin
-    return np.asarray(jaxlie.SE3.from_matrix(jnp.asarray(T, jnp.float32)).wxyz_xyz)
+def world_poses(
+    local: jaxlie.SE3,
+    target_origin: Float[np.ndarray, "*batch 3"],
+    source_origin: Float[np.ndarray, "*batch 3"],
+) -> Float[np.ndarray, "*batch 4 4"]:
+    """Poses between the scans' own frames, from those between local frames about the given origins."""
+    T = np.zeros((*local.wxyz_xyz.shape[:-1], 4, 4))
+    quaternion = np.asarray(local.rotation().wxyz, np.float64)
+    R = Rotation.from_quat(quaternion.reshape(-1, 4), scalar_first=True).as_matrix()
+    T[..., :3, :3] = R.reshape(*quaternion.shape[:-1], 3, 3)
+    turned = np.einsum("...ij,...j->...i", T[..., :3, :3], source_origin)
+    T[..., :3, 3] = np.asarray(local.translation(), np.float64) + target_origin - turned
+    T[..., 3, 3] = 1.0
+    return T
+
+
+def local_poses(
+    T_target_source: Float[np.ndarray, "*batch 4 4"],
+    target_origin: Float[np.ndarray, "*batch 3"],
+    source_origin: Float[np.ndarray, "*batch 3"],
+) -> jaxlie.SE3:
+    """Poses between local frames about the given origins, float32; the inverse of `world_poses`."""
+    R = T_target_source[..., :3, :3]
+    turned = np.einsum("...ij,...j->...i", R, source_origin)
+    shift = turned + T_target_source[..., :3, 3] - target_origin
+    quaternion = Rotation.from_matrix(R.reshape(-1, 3, 3)).as_quat(scalar_first=True, canonical=True)
+    both = np.concatenate([quaternion.reshape(*R.shape[:-2], 4), shift], axis=-1)
+    return jaxlie.SE3(both.astype(np.float32))  # type: ignore[arg-type]

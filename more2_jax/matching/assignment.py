@@ -1,4 +1,4 @@
-"""TODO"""
+"""The likeliest assignment of objects to instances, and what it leaves over, from log odds of pairs."""
 
 from __future__ import annotations
 
@@ -8,17 +8,9 @@ from scipy.optimize import linear_sum_assignment
 from scipy.special import expit
 
 LogOdds = Float[np.ndarray, "n m"]
-
-
 FARTHEST_M = 10.0  # what moved farther is no less likely for it
-
-
 LEAST_GAIN = 0.05  # share of its log odds that motion leaves a pair
-
-
 AS_GOOD = 1.0  # of log odds: an exchange that loses less is as good
-
-
 NEVER = -np.inf  # log odds of a pair that is no candidate
 
 

@@ -1,4 +1,8 @@
-"""TODO"""
+"""Log odds that two clouds show one object, from what is known of the pair: logistic regression on validation rooms.
+
+Beyond the paper (`EvidenceMatcher`). How the weights were fitted, and how well they hold, is in docs/relocalization.md;
+`python -m eval.calibration` fits them anew for other weights of the prior.
+"""
 
 from __future__ import annotations
 
@@ -7,11 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from more2_jax.config import RegistrationConfig
-from more2_jax.matching.pair_evidence import Evidence, asks_prior
-from more2_jax.registration.surface import (
-    LIFTED,
-)
+from more2_jax.config import MotionModel, SurfaceSearch
+from more2_jax.matching.pair_evidence import PairEvidence, asks_prior
+from more2_jax.registration.pose_costs import LIFTED
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,15 +42,11 @@ class Calibration:
 
 
 HIGHEST = 0.2
-
-
 UNKNOWN = 0.5  # of `off_own`: a prior that lays a cloud so far off its own surface has no say
 
 
 # Logistic regression on pairs of validation rooms; how, and how well it holds, is in docs/relocalization.md.
 UPRIGHT = Calibration(intercept=3.7, nearer=-6.9, farther=-1.0, size=-2.7, likeness=2.6, lift=-2.5, top=-21.0)
-
-
 FREE = Calibration(
     intercept=2.6, nearer=-6.9, farther=0.0, size=-4.0, likeness=7.25, off_less=-11.1, off_more=-6.5
 )
@@ -59,20 +57,21 @@ UNASKED = Calibration(intercept=1.2, nearer=-9.9, farther=-3.3, size=-4.2, liken
 
 
 def calibrated(
-    evidence: Evidence, compared: Compared, config: RegistrationConfig, upright: bool
+    evidence: PairEvidence, compared: Compared, search: SurfaceSearch, motion: MotionModel
 ) -> Float[np.ndarray, "*pairs"]:
-    """`log_odds` as these settings were calibrated; `upright`: things stand on the floor of one frame.
+    """`log_odds` by the weights fitted for these settings; upright: things stand on the floor of one frame.
 
-    Weights that know nothing of a pair's clouds have no say in it."""
-    if upright:
+    A prior that knows nothing of a pair's clouds has no say in it.
+    """
+    if motion == "upright":
         return log_odds(evidence, compared, UPRIGHT)
     unasked = log_odds(evidence, compared, UNASKED)
-    if not asks_prior(config, upright):
+    if not asks_prior(search, motion):
         return unasked
-    return np.where(np.asarray(evidence.off_own) <= UNKNOWN, log_odds(evidence, compared, FREE), unasked)
+    return np.where(evidence.off_own <= UNKNOWN, log_odds(evidence, compared, FREE), unasked)
 
 
-def log_odds(evidence: Evidence, compared: Compared, c: Calibration) -> Float[np.ndarray, "*pairs"]:
+def log_odds(evidence: PairEvidence, compared: Compared, c: Calibration) -> Float[np.ndarray, "*pairs"]:
     """Of every pair to be one object."""
     return weighed(features(evidence, compared), c) + compared.color
 
@@ -83,9 +82,8 @@ def weighed(known: dict[str, Float[np.ndarray, "*pairs"]], c: Calibration) -> Fl
     return c.intercept + np.sum(parts, axis=0)
 
 
-def features(evidence: Evidence, compared: Compared) -> dict[str, Float[np.ndarray, "*pairs"]]:
+def features(evidence: PairEvidence, compared: Compared) -> dict[str, Float[np.ndarray, "*pairs"]]:
     """What each weight of a `Calibration` is multiplied with, by its name."""
-    radius = np.asarray(evidence.radius)
     ways = np.stack([evidence.of_source, evidence.of_target])
     off = np.stack([evidence.off_source, evidence.off_target])
     return {
@@ -93,8 +91,8 @@ def features(evidence: Evidence, compared: Compared) -> dict[str, Float[np.ndarr
         "farther": ways.max(axis=0),
         "size": compared.size,
         "likeness": compared.likeness,
-        "lift": np.minimum(np.asarray(evidence.lift) / (LIFTED * radius), 1.0),
-        "top": np.minimum(compared.top_m / radius, HIGHEST),
+        "lift": np.minimum(evidence.lift_m / (LIFTED * evidence.radius_m), 1.0),
+        "top": np.minimum(compared.top_m / evidence.radius_m, HIGHEST),
         "off_less": off.min(axis=0),
         "off_more": off.max(axis=0),
     }

@@ -1,7 +1,7 @@
-"""Who is who, decided by geometry: the embedding proposes pairs, surfaces say how likely each is one object.
+"""Pairs of objects that may be one: proposed by embeddings and sizes, aligned once, weighed at any common height.
 
-Beyond the paper (preset `robust`). An object and an instance are matched when they are likelier one than two; what
-is left over is removed or added, with the probability that it is.
+Beyond the paper (`EvidenceMatcher`). What a search finds of a pair does not depend on how high the two scans are taken
+to lie: only what a change of height costs does. So pairs are aligned once, whatever heights are then tried.
 """
 
 from __future__ import annotations
@@ -11,123 +11,167 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
-from more2_jax.config import SceneConfig
-from more2_jax.geometry.padding import bucket
-from more2_jax.geometry.poses import in_frames
+from more2_jax.config import EvidenceMatcher, MotionModel, SurfaceSearch
+from more2_jax.geometry.poses import Pose
 from more2_jax.matching.assignment import NEVER, LogOdds
 from more2_jax.matching.calibration import Compared, calibrated
 from more2_jax.matching.color import color_evidence
-from more2_jax.matching.pair_evidence import HYPOTHESES, Evidence, asks_prior, pair_evidence
-from more2_jax.network.embedding_batch import at_zero, padded, stack, with_origin
+from more2_jax.matching.pair_evidence import (
+    PairEvidence,
+    asks_prior,
+    off_completed_surfaces,
+    off_own_surface,
+)
 from more2_jax.network.prior import Prior, check_embedding
+from more2_jax.registration.pair_batch import PairBatch, local_batch, paired_rows, take_pairs
+from more2_jax.registration.pose_costs import LIFTED
+from more2_jax.registration.search import AlignableObject, FoundPoses, alignable, search_poses
 from more2_jax.types import ObservedObject
 
-SMALLEST = 16  # pairs of a compiled call
 TOP = 0.99  # share of a cloud's points below its top
 
 
 @dataclass(frozen=True, kw_only=True)
-class PairFits:
-    """How every object fits every instance."""
+class AlignedPairs:
+    """The pairs of objects (n) and instances (m) that were aligned, and all that is known of them; p pairs."""
 
-    odds: LogOdds  # of being one; `NEVER` where the embeddings and sizes propose better partners
-    T_old_new: Float[np.ndarray, "n m h 4 4"]  # poses that fit, best first, float64; NaN where never tried
-
-
-@dataclass(frozen=True, kw_only=True)
-class Candidates:
-    """The pairs of objects and instances that are worth aligning, and all that is known of them; p pairs."""
-
-    among: Bool[np.ndarray, "n m"]
-    evidence: Evidence  # its poses are between local frames
+    among: Bool[np.ndarray, "n m"]  # which pairs these are; they are listed row by row
+    pairs: PairBatch  # instances onto objects, with the poses found
+    objects: tuple[AlignableObject, AlignableObject]  # instances and objects of the pairs, (p, …)
+    found: FoundPoses  # (p, k), local frames
+    T_old_new: Float[np.ndarray, "p k 4 4"]  # those poses between the clouds' frames, float64
     compared: Compared
-    T_old_new: Float[np.ndarray, "p h 4 4"]  # those poses between the clouds' frames, float64
+    top_gap_m: Float[np.ndarray, " p"]  # by how much the object's top is higher than the instance's
+    off: Float[np.ndarray, "p k 2"]  # off the completed surfaces; 0 where that is not asked
+    off_own: Float[np.ndarray, " p"]
+    height_m: float = 0.0  # upright: that the scan was taken to lie at
+
+    def take(self, chosen: Sequence[tuple[int, int]]) -> PairBatch:
+        """Some pairs (object, instance) as registration takes them: with the poses found, and as prepared."""
+        whole = dataclasses.replace(self.pairs, candidates=self.found.poses, prepared=self.objects)
+        return take_pairs(whole, [self.row_of(k, i) for k, i in chosen])
+
+    def row_of(self, object_row: int, instance_row: int) -> int:
+        """Where a pair is listed."""
+        return int(self.among.ravel()[: object_row * self.among.shape[1] + instance_row].sum())
 
 
-def fit_pairs(
-    prior: Prior, old: Sequence[ObservedObject], new: Sequence[ObservedObject], config: SceneConfig
-) -> PairFits:
-    """Aligns the likeliest pairs; all of `old` and `new` in one frame, or in two that differ by any motion.
+def align_candidates(
+    prior: Prior,
+    old: Sequence[ObservedObject],
+    new: Sequence[ObservedObject],
+    matcher: EvidenceMatcher,
+    motion: MotionModel,
+    T_scene_scan: Pose | None = None,
+) -> AlignedPairs:
+    """Aligns the likeliest pairs of `old` (scene's frame) and `new` (scan's frame).
 
-    Upright, the frames have one height (see `frames.common_height`). Raises ValueError as `check_known` does.
+    `T_scene_scan`: how the scan is taken to lie, for what did not move; by default in the scene's frame. Raises
+    ValueError where the prior is asked (any orientation, `search.field_weight`) about another encoder's records.
     """
-    tried = aligned_candidates(prior, old, new, config)
-    odds = np.full(tried.among.shape, NEVER)
-    odds[tried.among] = calibrated(tried.evidence, tried.compared, config.registration, config.upright)
-    poses = np.full((*tried.among.shape, HYPOTHESES, 4, 4), np.nan)
-    poses[tried.among] = tried.T_old_new
-    return PairFits(odds=odds, T_old_new=poses)
-
-
-def aligned_candidates(
-    prior: Prior, old: Sequence[ObservedObject], new: Sequence[ObservedObject], config: SceneConfig
-) -> Candidates:
-    """The likeliest pairs aligned: what `fit_pairs` weighs. Raises ValueError as `check_known` does."""
-    check_known(prior, (*old, *new), config)
+    if asks_prior(matcher.search, motion):
+        for o in (*old, *new):
+            check_embedding(prior, o.embedding, "match")
     known = compared(old, new)
-    among = proposed(proposal_of(known, config), config.matching.candidates)
-    rows = np.argwhere(among)
-    target, source = (padded([k.points for k in side]) for side in (old, new))
-    codes = [
-        at_zero(with_origin(stack([k.embedding for k in side])[0], np.asarray(cloud.origin)))
-        for side, cloud in ((new, source), (old, target))
-    ]
-    offset = np.asarray(source.origin)[:, None] - np.asarray(target.origin)[None]
-    flat = [dataclasses.replace(c, origin=jnp.zeros((len(c.points), 3))) for c in (source, target)]
-    pairs = np.zeros((bucket(len(rows), SMALLEST), 2), np.int32)
-    pairs[: len(rows)] = rows[:, ::-1]
-    found = pair_evidence(
-        prior,
-        *flat,
-        *codes,
-        jnp.asarray(offset, jnp.float32),
-        jnp.asarray(pairs),
-        config.registration,
-        config.upright,
+    among = proposed(proposal_of(known, matcher), matcher.candidates)
+    rows = np.argwhere(among)[:, ::-1]
+    source, target = local_batch(new), local_batch(old)
+    ready = [alignable(side, matcher.search) for side in (source, target)]
+    pairs = paired_rows(source, target, rows, np.eye(4) if T_scene_scan is None else T_scene_scan)
+    instances, known_objects = (
+        jax.tree.map(lambda x, at=at: x[at], side) for side, at in zip(ready, rows.T, strict=True)
     )
-    evidence = jax.tree.map(lambda x: np.asarray(x)[: len(rows)], jax.device_get(found))
-    origins = np.asarray(target.origin)[rows[:, 0]], np.asarray(source.origin)[rows[:, 1]]
-    return Candidates(
+    found = search_poses(instances, known_objects, pairs.stayed, matcher.search, motion)
+    off, own = np.zeros((*found.cost.shape, 2)), np.zeros(len(rows))
+    if asks_prior(matcher.search, motion):
+        found, off = off_completed_surfaces(prior, instances, known_objects, found, matcher.search)
+        own = np.max([off_own_surface(prior, x)[at] for x, at in zip(ready, rows.T, strict=True)], axis=0)
+    (_, top), (_, other) = heights(old), heights(new)
+    return AlignedPairs(
         among=among,
-        evidence=evidence,
+        pairs=pairs,
+        objects=(instances, known_objects),
+        found=found,
+        T_old_new=pairs.to_world(found.poses),
         compared=Compared(**{k: v[among] for k, v in vars(known).items()}),
-        T_old_new=in_frames(evidence.poses, *origins),
+        top_gap_m=(top[:, None] - other)[among],
+        off=off,
+        off_own=own,
+        height_m=0.0 if T_scene_scan is None else float(T_scene_scan[2, 3]),
     )
 
 
-def check_known(prior: Prior, known: Sequence[ObservedObject], config: SceneConfig) -> None:
-    """Raises ValueError where the prior is asked (any orientation, `field_weight`) about another encoder's records."""
-    if asks_prior(config.registration, config.upright):
-        for k in known:
-            check_embedding(prior, k.embedding, "match")
+def odds_of(
+    aligned: AlignedPairs, search: SurfaceSearch, motion: MotionModel, height_m: float = 0.0
+) -> LogOdds:
+    """Log odds of every pair to be one object, upright with `height_m` added to the new scan's heights.
+
+    `NEVER` for pairs that were not aligned.
+    """
+    evidence = evidence_at(aligned, search, motion, height_m)
+    top = np.abs(aligned.top_gap_m - height_m)
+    known = dataclasses.replace(aligned.compared, top_m=top)
+    odds = np.full(aligned.among.shape, NEVER)
+    odds[aligned.among] = calibrated(evidence, known, search, motion)
+    return odds
 
 
-def proposal_of(known: Compared, config: SceneConfig) -> LogOdds:
+def evidence_at(
+    aligned: AlignedPairs, search: SurfaceSearch, motion: MotionModel, height_m: float = 0.0
+) -> PairEvidence:
+    """What the best pose of every pair says, upright at a common height."""
+    found, radius = aligned.found, np.asarray(aligned.objects[1].radius)
+    z = np.asarray(found.poses.translation()[..., 2])
+    stayed = np.asarray(aligned.pairs.stayed.translation()[..., 2])[:, None]
+    lift = np.abs(z - stayed - (height_m - aligned.height_m))
+    best = np.zeros(len(z), int)  # as they are ordered
+    if motion == "upright":
+        cost = np.asarray(found.cost) - height_penalty(np.abs(z - stayed), radius, search)
+        best = np.argmin(cost + height_penalty(lift, radius, search), axis=1)
+    at = np.arange(len(best)), best
+    return PairEvidence(
+        of_source=np.asarray(found.of_source)[at],
+        of_target=np.asarray(found.of_target)[at],
+        lift_m=lift[at],
+        radius_m=radius,
+        off_source=aligned.off[at][:, 0],
+        off_target=aligned.off[at][:, 1],
+        off_own=aligned.off_own,
+    )
+
+
+def height_penalty(
+    lift_m: Float[np.ndarray, "p k"], radius_m: Float[np.ndarray, " p"], search: SurfaceSearch
+) -> Float[np.ndarray, "p k"]:
+    """`pose_costs.height_cost` on the host."""
+    return search.lift_weight * np.minimum(lift_m / (LIFTED * radius_m[:, None]), 1.0)
+
+
+def proposal_of(known: Compared, matcher: EvidenceMatcher) -> LogOdds:
     """By what the embeddings propose pairs: likeness, less a difference in size."""
-    return known.likeness - config.matching.size_weight * known.size
+    return known.likeness - matcher.size_weight * known.size
 
 
 def heights(side: Sequence[ObservedObject]) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
     """Heights of every cloud's lowest and highest points, meters."""
-    low, high = np.array([np.quantile(k.points[:, 2], (1 - TOP, TOP)) for k in side]).T
+    low, high = np.array([np.quantile(o.points[:, 2], (1 - TOP, TOP)) for o in side]).T
     return low, high
 
 
 def compared(old: Sequence[ObservedObject], new: Sequence[ObservedObject]) -> Compared:
     """Every object with every instance, by size, code, height and color."""
-    a, b = (np.array([float(k.embedding.scale) for k in side]) for side in (old, new))
-    x, y = (np.stack([np.asarray(k.embedding.inv, np.float64) for k in side]) for side in (old, new))
+    a, b = (np.array([float(o.embedding.scale) for o in side]) for side in (old, new))
+    x, y = (np.stack([np.asarray(o.embedding.inv, np.float64) for o in side]) for side in (old, new))
     x, y = (v / np.maximum(np.linalg.norm(v, axis=1, keepdims=True), 1e-30) for v in (x, y))
     (_, top), (_, other) = heights(old), heights(new)
     return Compared(
         size=np.abs(np.log(a[:, None] / b)),
         likeness=x @ y.T,
         top_m=np.abs(top[:, None] - other),
-        color=color_evidence([k.color for k in old], [k.color for k in new]),
+        color=color_evidence([o.color for o in old], [o.color for o in new]),
     )
 
 

@@ -12,7 +12,7 @@ import optax
 from jax import Array
 from jaxtyping import Bool, Float
 
-from more2_jax.config import MatchingConfig
+from more2_jax.config import CodeMatcher
 from more2_jax.geometry.points import kabsch_rotation
 from more2_jax.types import Embedding, Matches
 
@@ -30,19 +30,17 @@ def turning_error(a: Float[Array, "3 c"], b: Float[Array, "3 c"]) -> Float[Array
     return jnp.sqrt(jnp.maximum(jnp.sum((turned - b) ** 2), 1e-30))
 
 
-def pair_score(source: Embedding, target: Embedding, config: MatchingConfig) -> Float[Array, ""]:
-    """H = Λ ⊘ E, or one of its factors, less what a mismatch in metric size costs; differentiable."""
+def pair_score(source: Embedding, target: Embedding, config: CodeMatcher) -> Float[Array, ""]:
+    """H = Λ ⊘ E, or one of its factors; differentiable."""
     score = jnp.ones(())
     if config.score in ("inv", "both"):
         score = score * cosine(source.inv, target.inv)
     if config.score in ("eqv", "both"):
         score = score / jnp.maximum(turning_error(source.eqv, target.eqv), SMALLEST_ERROR)
-    if config.size_weight:
-        score = score - config.size_weight * jnp.abs(jnp.log(source.scale / target.scale))
     return score
 
 
-def score_matrix(source: Embedding, target: Embedding, config: MatchingConfig) -> Float[Array, "n m"]:
+def score_matrix(source: Embedding, target: Embedding, config: CodeMatcher) -> Float[Array, "n m"]:
     """`pair_score` of every source with every target."""
     row = jax.vmap(lambda s, t: pair_score(s, t, config), in_axes=(None, 0))
     return jax.vmap(row, in_axes=(0, None))(source, target)
@@ -90,10 +88,10 @@ def _only_allowed(
 def match_instances(
     source: Embedding,
     target: Embedding,
-    config: MatchingConfig,
-    source_real: Bool[np.ndarray, " n"] | None = None,
-    target_real: Bool[np.ndarray, " m"] | None = None,
-    bonus: Float[np.ndarray, "n m"] | None = None,
+    config: CodeMatcher,
+    source_real: Bool[Array | np.ndarray, " n"] | None = None,
+    target_real: Bool[Array | np.ndarray, " m"] | None = None,
+    bonus: Float[Array | np.ndarray, "n m"] | None = None,
 ) -> Matches:
     """Assigns the objects of one scan to those of another (paper §3.2); either may be empty.
 
@@ -103,29 +101,26 @@ def match_instances(
     n, m = source.scale.shape[0], target.scale.shape[0]
     if n == 0 or m == 0:
         return Matches(target_index=jnp.full(n, -1), score=jnp.zeros(n))
-    real = np.ones(n, bool) if source_real is None else np.asarray(source_real)
-    other = np.ones(m, bool) if target_real is None else np.asarray(target_real)
-    extra = np.zeros((n, m), np.float32) if bonus is None else np.asarray(bonus, np.float32)
+    real = np.ones(n, bool) if source_real is None else source_real
+    other = np.ones(m, bool) if target_real is None else target_real
+    extra = np.zeros((n, m), np.float32) if bonus is None else bonus
     if extra.shape != (n, m):
         raise ValueError(f"match_instances got a bonus of shape {extra.shape}; needed {(n, m)}")
-    plain = [dataclasses.replace(e, origin=jnp.zeros_like(e.center)) for e in (source, target)]
-    return _match(*plain, config, jnp.asarray(real), jnp.asarray(other), jnp.asarray(extra))
+    codes = [dataclasses.replace(e, origin=None) for e in (source, target)]
+    return _match(*codes, config, real, other, extra)
 
 
 @partial(jax.jit, static_argnames="config")
 def _match(
     source: Embedding,
     target: Embedding,
-    config: MatchingConfig,
+    config: CodeMatcher,
     source_real: Bool[Array, " n"],
     target_real: Bool[Array, " m"],
     bonus: Float[Array, "n m"],
 ) -> Matches:
     score = score_matrix(source, target, config) + bonus
     allowed = source_real[:, None] & target_real & jnp.isfinite(score)
-    if config.max_size_ratio:
-        ratio = jnp.abs(jnp.log(source.scale[:, None] / target.scale))
-        allowed &= ratio < jnp.log(config.max_size_ratio)
     assign = hungarian if config.assignment == "hungarian" else greedy
     index, chosen = assign(score, allowed)
     return Matches(target_index=index, score=chosen)

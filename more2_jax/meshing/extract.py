@@ -108,7 +108,7 @@ def observed_level(prior: Prior, embedding: Embedding, points: Float[np.ndarray,
 
 def canonical(embedding: Embedding, points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
     """Points of the scan's frame in canonical units, relative to the object's center."""
-    return (points - np.asarray(embedding.center, np.float64) - embedding.origin) / float(embedding.scale)
+    return (points - embedding.scan_center()) / float(embedding.scale)
 
 
 def lowest_height(embedding: Embedding, floor: float | None) -> float:
@@ -141,7 +141,7 @@ def _in_chunks(
     queries: Float[np.ndarray, "p 3"],
 ) -> Float[np.ndarray, "p *_"]:
     """What `of` gives at canonical offsets, asked for in chunks of a fixed size: one for few, one for many."""
-    local = dataclasses.replace(embedding, origin=jnp.zeros(3))
+    local = dataclasses.replace(embedding, origin=None)
     points = (queries * float(embedding.scale) + np.asarray(embedding.center)).astype(np.float32)
     chunk = FEW if len(points) <= FEW else CHUNK.get(jax.default_backend(), CHUNK_OF_OTHERS)
     padded = np.zeros((-(-max(len(points), 1) // chunk) * chunk, 3), np.float32)
@@ -204,6 +204,5 @@ def _surface(level: Level, embedding: Embedding) -> Mesh:
     padded = np.pad(values, 1, constant_values=max(float(values.max()), lattice.step))
     vertices, faces, _, _ = marching_cubes(padded, 0.0, gradient_direction="descent")
     offsets = lattice.at(vertices - 1)
-    origin = np.asarray(embedding.origin, np.float64)
-    placed = offsets * float(embedding.scale) + np.asarray(embedding.center, np.float64) + origin
+    placed = offsets * float(embedding.scale) + embedding.scan_center()
     return Mesh(vertices=placed.astype(np.float64), faces=faces.astype(np.int64))

@@ -91,6 +91,6 @@ def trusted(
 
 def box_half_width(o: SceneObject, config: SceneConfig) -> float:
     """Half the edge of the box to mesh, canonical units: at least the usual, and all of what was seen."""
-    center = np.asarray(o.embedding.center, np.float64) + o.embedding.origin
+    center = o.embedding.scan_center()
     seen = np.quantile(np.abs(accumulated_points(o) - center).max(axis=1), 0.99) / float(o.embedding.scale)
     return float(np.clip(1.15 * seen, config.meshing.half_width, 3 * config.meshing.half_width))

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Sequence
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
@@ -40,14 +38,3 @@ def stack(
     count = bucket(len(embeddings), smallest)
     rows = [*embeddings, *[embeddings[0]] * (count - len(embeddings))]
     return jax.tree.map(lambda *x: np.stack(x), *rows), np.arange(count) < len(embeddings)
-
-
-def with_origin(e: Embedding, origin: Float[np.ndarray, "*b 3"]) -> Embedding:
-    """The same embedding, its center relative to another origin; the difference is taken in float64."""
-    center = np.asarray(e.center, np.float64) + np.asarray(e.origin) - origin
-    return dataclasses.replace(e, center=jnp.asarray(center, jnp.float32), origin=np.asarray(origin))
-
-
-def at_zero(e: Embedding) -> Embedding:
-    """The embedding with its local frame for a frame: what traced code takes."""
-    return dataclasses.replace(e, origin=jnp.zeros_like(e.center))

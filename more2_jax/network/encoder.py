@@ -169,9 +169,9 @@ class Encoder(nn.Module):
     def __call__(self, points: Float[Array, "n 3"], mask: Bool[Array, "n"]) -> Embedding:
         c = self.config
         mean = masked_mean(points, mask)
-        centerd = jnp.where(mask[:, None], points - mean, 0.0)
-        radius = power_of_two(jnp.sqrt(masked_mean(jnp.sum(centerd**2, axis=-1), mask)))
-        levels = self.blocks(centerd / radius, mask)
+        centered = jnp.where(mask[:, None], points - mean, 0.0)
+        radius = power_of_two(jnp.sqrt(masked_mean(jnp.sum(centered**2, axis=-1), mask)))
+        levels = self.blocks(centered / radius, mask)
         features, mask = levels[-1]
         head = VNLA(c.code, c.leak, shared_direction=True, name="head")(features)
         x = masked_mean(head, mask)
@@ -183,8 +183,7 @@ class Encoder(nn.Module):
             eqv=eqv,
             scale=norm(x).mean() * c.output_scale * radius,
             center=mean + offset,
-            origin=jnp.zeros(3, points.dtype),
-            anchors=tuple(anchors(centerd - offset, *levels[i]) for i in self.keep),
+            anchors=tuple(anchors(centered - offset, *levels[i]) for i in self.keep),
         )
 
     def blocks(

@@ -130,9 +130,9 @@ def sdf(
         raise ValueError(
             f"sdf got points {points.shape} for {embedding.scale.shape} objects; needed (objects, n, 3)"
         )
-    local = jnp.asarray(points - embedding.origin[:, None], jnp.float32)
-    at_zero = dataclasses.replace(embedding, origin=jnp.zeros_like(embedding.center))
-    return _sdf_many(prior, at_zero, local)
+    if embedding.origin is not None:
+        points = points - embedding.origin[:, None]
+    return _sdf_many(prior, dataclasses.replace(embedding, origin=None), jnp.asarray(points, jnp.float32))
 
 
 def save_prior(prior: Prior, path: str | Path, half: bool = True) -> None:

@@ -6,6 +6,8 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
+import numpy as np
+from jax.core import Tracer
 from jax.sharding import Mesh, PartitionSpec
 
 Tree = Any  # of arrays
@@ -32,3 +34,23 @@ def in_turn(
     whole, split = PartitionSpec(), PartitionSpec(mesh.axis_names)
     share = jax.shard_map(some, mesh=mesh, in_specs=(whole, split), out_specs=split, check_vma=False)
     return share(shared, rows)
+
+
+def chunked(function: Callable[[Tree], Tree], size: int, rows: Tree) -> Tree:
+    """`function` of `rows` (leading axis b), in calls of `size` rows each: one compiled program whatever b is.
+
+    The last call's filling repeats its first row. Traced rows, whose number is part of a larger program anyway, go in
+    one call. Results are host arrays, but for traced rows.
+    """
+    leaves = jax.tree.leaves(rows)
+    if any(isinstance(x, Tracer) for x in leaves):
+        return function(rows)
+    count = len(leaves[0])
+    host = jax.tree.map(np.asarray, rows)
+    found = []
+    for start in range(0, max(count, 1), size):
+        stop = min(start + size, count)
+        at = np.r_[start:stop, np.full(size - (stop - start), start)]
+        part = function(jax.tree.map(lambda x, at=at: x[at], host))
+        found.append(jax.tree.map(lambda x, n=stop - start: x[:n], jax.device_get(part)))
+    return jax.tree.map(lambda *x: np.concatenate(x), *found) if len(found) > 1 else found[0]

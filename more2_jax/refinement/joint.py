@@ -17,21 +17,23 @@ from jaxtyping import Bool, Float
 from more2_jax.config import JointConfig
 from more2_jax.geometry.points import cloud_radius, farthest_points, transformed
 from more2_jax.geometry.se3_descent import adam, descend
-from more2_jax.geometry.transform import move_embedding, scale_embedding
+from more2_jax.geometry.transform import rescale, transform
 from more2_jax.network.prior import Prior, field_sdf, object_field
-from more2_jax.types import Embedding, JointFit, pytree
+from more2_jax.types import Embedding, JointFit, pytree, quantity
 
 
 @pytree
 class Observations:
     """One object, seen up to k times; every cloud in its own local frame. Row 0 is the reference."""
 
-    points: Float[Array, "*b k n 3"]
-    mask: Bool[Array, "*b k n"]
-    real: Bool[Array, "*b k"]  # False: padding
-    codes: Embedding  # (*b, k, …): of every observation alone
-    T_ref_obs: jaxlie.SE3  # (*b, k): observation's local frame to the reference's
-    accumulated: Embedding  # (*b, …): of all observations together, in the reference's local frame
+    points: Float[Array, "*b k n 3"] = quantity("position")
+    mask: Bool[Array, "*b k n"] = quantity("invariant")
+    real: Bool[Array, "*b k"] = quantity("invariant")  # False: padding
+    codes: Embedding = quantity("record")  # (*b, k, …): of every observation alone
+    T_ref_obs: jaxlie.SE3 = quantity("pose")  # (*b, k): observation's local frame to the reference's
+    accumulated: Embedding = quantity(
+        "record"
+    )  # (*b, …): of all observations together, in the reference's local frame
 
 
 def fit_jointly(prior: Prior, observations: Observations, config: JointConfig) -> JointFit:
@@ -68,11 +70,12 @@ def fit_one(prior: Prior, seen: Observations, config: JointConfig) -> JointFit:
     drift = jax.tree.map(lambda x: x[0], best["pose"]).inverse()
     code = dataclasses.replace(start, inv=best["inv"], eqv=best["eqv"], center=best["center"])
     poses = jax.vmap(lambda T: drift @ T)(best["pose"])
-    return JointFit(
-        embedding=scale_embedding(move_embedding(code, drift), radius),
-        T_ref_obs=_scale_translation(poses, radius),
+    fit = JointFit(
+        embedding=transform(code, drift),
+        T_ref_obs=poses,
         loss=lowest,
     )
+    return rescale(fit, radius)
 
 
 def optimizer(config: JointConfig) -> optax.GradientTransformation:
@@ -115,25 +118,10 @@ def best_code(prior: Prior, seen: Observations) -> Embedding:
     losses = jax.vmap(own_loss)(seen.codes, seen.points, seen.mask)
     best = jnp.argmin(jnp.where(seen.real & jnp.isfinite(losses), losses, jnp.inf))
     code, T = jax.tree.map(lambda x: x[best], (seen.codes, seen.T_ref_obs))
-    return move_embedding(code, T)
+    return transform(code, T)
 
 
 def thin(seen: Observations, points: int) -> Observations:
     """Every cloud in farthest-point order, at most `points`."""
     clouds, mask = jax.vmap(lambda p, m: farthest_points(p, m, points))(seen.points, seen.mask)
     return dataclasses.replace(seen, points=clouds, mask=mask)
-
-
-def rescale(seen: Observations, factor: Float[Array, ""]) -> Observations:
-    """The observations in other units of length."""
-    return dataclasses.replace(
-        seen,
-        points=seen.points * factor,
-        codes=scale_embedding(seen.codes, factor),
-        accumulated=scale_embedding(seen.accumulated, factor),
-        T_ref_obs=_scale_translation(seen.T_ref_obs, factor),
-    )
-
-
-def _scale_translation(T: jaxlie.SE3, factor: Float[Array, ""]) -> jaxlie.SE3:
-    return jaxlie.SE3.from_rotation_and_translation(T.rotation(), T.translation() * factor)

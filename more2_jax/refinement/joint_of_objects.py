@@ -12,18 +12,17 @@ import numpy as np
 
 from more2_jax.config import SceneConfig
 from more2_jax.geometry.padding import bucket
-from more2_jax.geometry.poses import Pose, apply_pose, local_pose, world_pose
+from more2_jax.geometry.poses import Pose, apply_pose, local_poses, world_poses
 from more2_jax.network.embedding_batch import (
     SMALLEST_BATCH,
-    at_zero,
     embed,
     padded,
     stack,
     unstack,
-    with_origin,
 )
 from more2_jax.network.prior import Prior, encode
 from more2_jax.refinement.joint import Observations, fit_jointly
+from more2_jax.registration.pair_batch import about
 from more2_jax.tracking.objects import accumulated, accumulated_points, points_of
 from more2_jax.types import SceneObject
 
@@ -56,7 +55,7 @@ def fit_objects(
             jax.tree.map(lambda x, n=n, j=j: x[n, j], fit.T_ref_obs)
             for j in range(len(accumulated(objects[k])))
         ]
-        poses = [world_pose(T, origins[n, 0], origins[n, j]) for j, T in enumerate(local)]
+        poses = [world_poses(T, origins[n, 0], origins[n, j]) for j, T in enumerate(local)]
         embedding = dataclasses.replace(embeddings[n], origin=origins[n, 0])
         result[k] = dataclasses.replace(repose(objects[k], poses), embedding=embedding)
     return result
@@ -78,15 +77,18 @@ def gather(
     real[:, 0] = True
     for n, o in enumerate(objects):
         for j, seen in enumerate(accumulated(o)):
-            real[n, j], poses[n, j] = True, local_pose(seen.T_ref_scan, origins[n, 0], origins[n, j])
+            real[n, j], poses[n, j] = (
+                True,
+                local_poses(seen.T_ref_scan, origins[n, 0], origins[n, j]).wxyz_xyz,
+            )
     split = lambda x: jnp.asarray(x).reshape(-1, most, *x.shape[1:])[:count]  # noqa: E731
     return Observations(
         points=split(cloud.points),
         mask=split(cloud.mask),
         real=jnp.asarray(real),
-        codes=jax.tree.map(split, at_zero(codes)),
+        codes=jax.tree.map(split, dataclasses.replace(codes, origin=None)),
         T_ref_obs=jaxlie.SE3(jnp.asarray(poses, jnp.float32)),
-        accumulated=at_zero(with_origin(together, origins[:, 0])),
+        accumulated=about(together, origins[:, 0]),
     ), origins
 
 

@@ -96,7 +96,7 @@ def close_step(
     H = jnp.eye(count)[:, :, None, None] * both.sum(axis=1)[:, None] - both
     right = (vector.sum(axis=1) - vector.sum(axis=0))[1:].reshape(-1)
     H = H[1:, 1:].swapaxes(1, 2).reshape(len(right), len(right))
-    free = jnp.tile(free_directions(upright), count - 1)
+    free = jnp.tile(free_directions("upright" if upright else "free"), count - 1)
     # Against the number of points, not the sum of weights: where hardly any has a partner, nothing is to move.
     each = placed.mask.sum() / jnp.maximum(placed.mask.any(axis=1).sum(), 1)
     H = (H + (DAMPING * each + 1e-9) * jnp.eye(len(right))) * free * free[:, None]

@@ -112,7 +112,7 @@ def moved_by(o: SceneObject, moves: np.ndarray, most_turn_deg: float) -> SceneOb
     A move that is not finite, or turns farther than `most_turn_deg`, is none: poses are made better here, not found.
     """
     scale = float(o.embedding.scale)
-    center = np.asarray(o.embedding.center, np.float64) + o.embedding.origin
+    center = o.embedding.scan_center()
     poses: list[Pose] = [seen.T_ref_scan for seen in accumulated(o)]
     for j, k in enumerate(few(o)):
         T = np.asarray(moves[j], np.float64)

@@ -1,4 +1,4 @@
-"""Where registration starts from: poses worth trying for one pair (METHOD 4, and beyond it in `robust`)."""
+"""Where registration starts from: poses worth trying for one pair (paper §3.3, and beyond it)."""
 
 from __future__ import annotations
 
@@ -6,58 +6,52 @@ import jax
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
-from jax import Array
-from jaxtyping import Float
+from jaxtyping import Array, Bool, Float
 from scipy.spatial.transform import Rotation
 
-from more2_jax.config import RegistrationConfig
-from more2_jax.geometry.points import Sampled, kabsch, kabsch_rotation
-from more2_jax.types import Embedding, Sight, pytree
-
-
-@pytree
-class Pair:
-    """A source to be moved onto a target; local frames."""
-
-    source: Sampled
-    target: Sampled
-    source_code: Embedding
-    target_code: Embedding
-    offset: Float[Array, "*b 3"]  # source's origin minus target's, meters, in the frame both scans share
-    source_sight: Sight | None = None  # what was seen around each, where sensors are known
-    target_sight: Sight | None = None
+from more2_jax.config import MotionModel
+from more2_jax.geometry.points import kabsch, kabsch_rotation
+from more2_jax.types import Embedding
 
 
 def embedding_pose(source: Embedding, target: Embedding) -> jaxlie.SE3:
-    """The paper's start: Kabsch on `F_se3 = F_eqv + F_c` as 256 corresponding points (§3.3)."""
+    """The paper's start: Kabsch on `F_se3 = F_eqv + F_c` as corresponding points, one a channel (§3.3)."""
     a, b = source.eqv.T + source.center, target.eqv.T + target.center
     return kabsch(a, b, jnp.ones(len(a), a.dtype))
 
 
-def candidate_poses(pair: Pair, config: RegistrationConfig, upright: bool) -> jaxlie.SE3:
-    """All starts of a pair, batched: every rotation about the codes' centers and about the clouds' means.
+def candidate_poses(
+    codes: tuple[Embedding, Embedding],
+    means: tuple[Float[Array, "3"], Float[Array, "3"]],
+    stayed: jaxlie.SE3,
+    turns: int,
+    motion: MotionModel,
+) -> jaxlie.SE3:
+    """All starts of a pair (source, target), batched: every rotation about the codes' centers and the clouds' means.
 
-    Upright, in scans of one frame, those about the means keep their height: what stands on the floor stays there."""
-    if config.starts == "embedding":
-        return jax.tree.map(lambda x: x[None], embedding_pose(pair.source_code, pair.target_code))
-    rotations = candidate_rotations(pair, config, upright)
-    from_codes = place(rotations, pair.source_code.center, pair.target_code.center)
-    from_means = place(rotations, _mean(pair.source), _mean(pair.target))
-    if upright and config.identity_start:
-        level = from_means.translation().at[:, 2].set(pair.offset[2])
+    Upright, those about the means keep their height: what stands on the floor stays there. `turns`: as
+    `candidate_rotations`.
+    """
+    rotations = candidate_rotations(*codes, turns, motion)
+    from_codes = place(rotations, codes[0].center, codes[1].center)
+    from_means = place(rotations, *means)
+    if motion == "upright":
+        level = from_means.translation().at[:, 2].set(stayed.translation()[2])
         from_means = jaxlie.SE3.from_rotation_and_translation(rotations, level)
     return jax.tree.map(lambda *x: jnp.concatenate(x), from_codes, from_means)
 
 
-def candidate_rotations(pair: Pair, config: RegistrationConfig, upright: bool) -> jaxlie.SO3:
-    """The embedding's rotation, and turns about the vertical (`upright`) or the 60 rotations of an icosahedron.
+def candidate_rotations(source: Embedding, target: Embedding, turns: int, motion: MotionModel) -> jaxlie.SO3:
+    """The embeddings' rotation, and `turns` about the vertical (upright) or the 60 rotations of an icosahedron.
 
-    `upright`: of the embedding's, the nearest turn about the vertical."""
-    by_code = kabsch_rotation(pair.source_code.eqv.T, pair.target_code.eqv.T).as_matrix()
-    others = yaw_turns(config.yaw_starts) if upright and config.yaw_starts else icosahedral_rotations()
+    Upright, of the embeddings' rotation the nearest turn about the vertical.
+    """
+    by_code = kabsch_rotation(source.eqv.T, target.eqv.T).as_matrix()
+    others = turns_about_vertical(turns) if motion == "upright" else icosahedral_rotations()
     matrices = jnp.concatenate([by_code[None], jnp.asarray(others, by_code.dtype)])
-    rotations = jax.vmap(jaxlie.SO3.from_matrix)
-    return rotations(matrices) if not upright else jax.vmap(jaxlie.SO3.from_z_radians)(yaw_of(matrices))
+    if motion == "upright":
+        return jax.vmap(jaxlie.SO3.from_z_radians)(yaw_of(matrices))
+    return jax.vmap(jaxlie.SO3.from_matrix)(matrices)
 
 
 def yaw_of(matrix: Float[Array, "*b 3 3"]) -> Float[Array, "*b"]:
@@ -76,11 +70,12 @@ def place(
     return jax.vmap(one)(rotations)
 
 
-def _mean(cloud: Sampled) -> Float[Array, "3"]:
-    return (cloud.mask / jnp.maximum(cloud.mask.sum(), 1)) @ cloud.points
+def masked_mean(points: Float[Array, "n 3"], mask: Bool[Array, " n"]) -> Float[Array, "3"]:
+    """The mean of the real points."""
+    return (mask / jnp.maximum(mask.sum(), 1)) @ points
 
 
-def yaw_turns(count: int) -> Float[np.ndarray, "count 3 3"]:
+def turns_about_vertical(count: int) -> Float[np.ndarray, "count 3 3"]:
     """`count` turns about z, evenly spaced, the first none at all."""
     angle = 2 * np.pi * np.arange(count) / count
     zero, one = np.zeros(count), np.ones(count)

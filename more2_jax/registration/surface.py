@@ -1,259 +1,170 @@
-"""Registration of one pair by its surfaces: every start aligned, the best told by a truncated distance.
+"""Registration of pairs by their surfaces: the poses that a search found refined, the best told by what they explain.
 
-Beyond the paper (`RegistrationConfig.refine` "surface"): point-to-plane alignment both ways takes the place of the
-descent on the field, and poses are compared by the share of both clouds that finds its like, not by a residual that
-the unseen spoils. What has no like in the other cloud may still lie on the surface that the prior completes it with:
-poses that fit about as well are told apart by that.
+Beyond the paper (`SurfaceRegistration`): point-to-plane alignment both ways takes the place of the descent on the
+field, and poses are compared by the share of both clouds that finds its like, not by a residual that the unseen
+spoils. What has no like in the other cloud may still lie on the surface that the prior completes it with: poses that
+fit about as well are told apart by that.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import dataclasses
+from functools import partial
 
 import jax
 import jax.numpy as jnp
 import jaxlie
-from jax import Array
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
-from more2_jax.config import RegistrationConfig
-from more2_jax.geometry.free_space import looked_through
-from more2_jax.geometry.point_to_plane import (
-    Surface,
-    align,
-    align_step,
-    coarsened,
-    correspondences,
-    pose_covariance,
-    thinned,
-    whole_surface,
+from more2_jax.config import MotionModel, SurfaceRegistration
+from more2_jax.geometry.point_to_plane import Surface, align, align_step, pose_covariance, thinned
+from more2_jax.geometry.points import two_way_rms
+from more2_jax.geometry.transform import rescale, transform
+from more2_jax.network.prior import Prior
+from more2_jax.network.row_map import chunked
+from more2_jax.registration.pair_batch import PairBatch
+from more2_jax.registration.pose_costs import (
+    field_cost,
+    free_space_cost,
+    height_cost,
+    lowest_apart,
+    misfit,
+    off_fields,
+    turned_apart,
 )
-from more2_jax.geometry.points import FAR, Sampled, move, transformed, two_way_rms
-from more2_jax.network.prior import Prior, field_sdf, object_field
-from more2_jax.registration.starting_poses import Pair
-from more2_jax.types import Embedding, Registration, Sight
+from more2_jax.registration.search import (
+    AlignableObject,
+    alignable,
+    concatenated,
+    scaled_pose,
+    search_poses,
+)
+from more2_jax.types import Registration
 
-Way = Callable[[jaxlie.SE3], jaxlie.SE3]
-
+PAIRS_A_CALL = 4  # refined together: a scene's pairs are few, and filling costs as much as pairs do
 STILL = 1e-2  # a last step below this (radians, and shares of the radius) has settled
 # How much worse "it did not move" may fit and still be chosen; so much worse, another pose still competes.
 STAYED_RATIO, STAYED_OFFSET = 1.1, 0.01
 FINE = 0.25  # share of the truncation: the nearer one by which refined poses are told apart
-POINT_SHARE = 0.4  # of the distance to the nearest point, in a misfit; the rest is that off its surface
 TURNED_DEG = 15.0  # competing poses differ by more
-APART_DEG = 25.0  # poses kept for refinement differ by at least this
-OFF_FIELD = 0.1  # canonical units: farther than this from the other's completed surface is this far
-ABOUT_AS_WELL = 0.2  # of misfit: poses that fit worse than the best by more are not the prior's to choose
-CLEARLY = 0.05  # shares of the radius: a point so deep in free space counts in full
-LIFTED = 0.1  # shares of the radius: an object lifted by this costs all of `lift_weight`
 
 
-def register_surfaces(
-    prior: Prior, starts: jaxlie.SE3, pair: Pair, config: RegistrationConfig, upright: bool
+def register_by_surfaces(
+    prior: Prior, pairs: PairBatch, settings: SurfaceRegistration, motion: MotionModel
 ) -> Registration:
-    """The best pose of all starts, its covariance, and the poses that explain the clouds as well.
-
-    `pair` is in units of the target's radius, and so is the result. `loss` and `misfit` are the truncated distance.
-    """
-    whole = [whole_surface(c.dense, c.dense_mask) for c in (pair.source, pair.target)]
-    coarse = [coarse_of(s, config) for s in whole]
-    starts, _ = search(starts, coarse[0], coarse[1], pair, config, upright)
-    source, target = (thinned(s, config.surface_points) for s in whole)
-    stayed = jax.tree.map(lambda x: x[None], jaxlie.SE3.from_translation(pair.offset))
-    if config.identity_start:
-        starts = join(starts, stayed)
-    reach = (config.first_reach, config.last_reach)
-    truncations = (FINE * config.truncation, config.truncation)
-    poses = jax.vmap(lambda T: align(T, source, target, reach, config.surface_steps, upright))(starts)
-    if config.identity_start:
-        poses = join(poses, stayed)  # also exactly as it is
-    misfits = jax.vmap(lambda T: misfit(T, source, target, truncations))(poses)
-    costs = misfits + lifted(poses, pair.offset, config, upright) + freed(poses, pair, source, target, config)
-    doubt = prior_doubts(prior, poses, costs, pair, whole, config)
-    best = choose(costs, config.identity_start, doubt)
-    T = polished(jax.tree.map(lambda x: x[best], poses), whole, misfits[best], config, upright)
-    if config.identity_start:  # what stayed is exactly where it was
-        T = jax.tree.map(lambda x, y: jnp.where(best == len(misfits) - 1, y[0], x), T, stayed)
-    rms = two_way_rms(move(T, source.sampled), target.sampled, config.trim)
-    still = settled(T, source, target, config, upright)
-    return Registration(
-        T_target_source=T,
-        loss=misfits[best],
-        rms_m=jnp.where(jnp.isfinite(rms), rms, jnp.inf),
-        converged=still & (rms < config.converged_rms),
-        misfit=misfits[best],
-        covariance=pose_covariance(T, source, target, config.last_reach, upright),
-        competing=poses,
-        competes=competing(poses, costs + doubt, best),
+    """All pairs of a batch: their candidates refined, or those of a search of their own where they have none."""
+    source, target = pairs.prepared or tuple(
+        alignable(side, settings.search) for side in (pairs.source, pairs.target)
     )
+    candidates = pairs.candidates
+    if candidates is None:
+        candidates = search_poses(source, target, pairs.stayed, settings.search, motion).poses
+    return refine_poses(prior, (source, target), candidates, pairs.stayed, settings, motion)
 
 
-def settled(
-    T: jaxlie.SE3, source: Surface, target: Surface, config: RegistrationConfig, upright: bool
-) -> Bool[Array, ""]:
-    """Whether one more step hardly changes the pose."""
-    last = align_step(T, source, target, jnp.asarray(config.last_reach), upright)
-    return jnp.linalg.norm((last @ T.inverse()).log()) < STILL
+def refine_poses(
+    prior: Prior,
+    objects: tuple[AlignableObject, AlignableObject],
+    candidates: jaxlie.SE3,
+    stayed: jaxlie.SE3,
+    settings: SurfaceRegistration,
+    motion: MotionModel,
+) -> Registration:
+    """Refines `candidates` (b, k) of pairs of `objects` (source, target); meters, local frames."""
+    one_call = partial(_refine_poses, prior, settings=settings, motion=motion)
+    return chunked(one_call, PAIRS_A_CALL, (*objects, candidates, stayed))
 
 
-def coarse_of(s: Surface, config: RegistrationConfig) -> Surface:
-    """The surface as `search` takes it."""
-    return coarsened(s, config.coarse_points, config.coarse_dense, config.cells)
+@partial(jax.jit, static_argnames=("settings", "motion"))
+def _refine_poses(
+    prior: Prior,
+    pairs: tuple[AlignableObject, AlignableObject, jaxlie.SE3, jaxlie.SE3],
+    settings: SurfaceRegistration,
+    motion: MotionModel,
+) -> Registration:
+    def one(
+        source: AlignableObject, target: AlignableObject, candidates: jaxlie.SE3, stayed: jaxlie.SE3
+    ) -> Registration:
+        return refine_pair(prior, source, target, candidates, stayed, settings, motion)
+
+    return jax.vmap(one)(*pairs)
 
 
-def search(
-    starts: jaxlie.SE3,
-    source: Surface,
-    target: Surface,
-    pair: Pair,
-    config: RegistrationConfig,
-    upright: bool,
-) -> tuple[jaxlie.SE3, Float[Array, " k"]]:
-    """Aligns every start by coarse surfaces; the best `keep_starts` that lie apart, and their costs."""
-    reach = (config.search_reach, config.first_reach)
-    moved = jax.vmap(lambda T: align(T, source, target, reach, config.coarse_steps, upright))(starts)
-    cost = jax.vmap(lambda T: misfit(T, source, target, (config.truncation,)))(moved)
-    cost = cost + lifted(moved, pair.offset, config, upright) + freed(moved, pair, source, target, config)
-    best = lowest_apart(cost, moved.rotation(), min(config.keep_starts, len(cost)))
-    return jax.tree.map(lambda x: x[best], moved), cost[best]
+def refine_pair(
+    prior: Prior,
+    source: AlignableObject,
+    target: AlignableObject,
+    candidates: jaxlie.SE3,
+    stayed: jaxlie.SE3,
+    settings: SurfaceRegistration,
+    motion: MotionModel,
+) -> Registration:
+    """One pair: the best of its poses refined, its covariance, and the poses that explain the clouds as well.
+
+    Works in units of the target's radius. `loss` and `misfit` are the truncated distance. Differentiable, the
+    correspondences held.
+    """
+    radius, search = target.radius, settings.search
+    source, target = rescale(source, 1 / radius), rescale(target, 1 / radius)
+    starts, stayed = scaled_pose(candidates, 1 / radius), scaled_pose(stayed, 1 / radius)
+    s, t = thinned(source.whole, settings.points), thinned(target.whole, settings.points)
+    one_stayed = jax.tree.map(lambda x: x[None], stayed)
+    if settings.try_stayed:
+        starts = concatenated(starts, one_stayed)
+    reach = (settings.first_reach, settings.last_reach)
+    poses = jax.vmap(lambda T: align(T, s, t, reach, settings.steps, motion))(starts)
+    if settings.try_stayed:
+        poses = concatenated(poses, one_stayed)  # also exactly as it is
+    misfits = jax.vmap(lambda T: misfit(T, s, t, truncations(settings)))(poses)
+    costs = misfits + height_cost(poses, stayed, search, motion)
+    costs += free_space_cost(poses, (s, t), (source.sight, target.sight), search, motion)
+    chosen = finalists(costs, poses, settings)
+    poses, misfits, costs = jax.tree.map(lambda x: x[chosen], (poses, misfits, costs))
+    doubt = prior_cost(prior, poses, costs, (source, target), settings)
+    best = choose(costs, settings.try_stayed, doubt)
+    T = polished(jax.tree.map(lambda x: x[best], poses), (source, target), misfits[best], settings, motion)
+    if settings.try_stayed:  # what stayed is exactly where it was
+        T = jax.tree.map(lambda x, y: jnp.where(best == len(misfits) - 1, y, x), T, stayed)
+    found = scored(T, s, t, settings, motion)
+    found = dataclasses.replace(
+        found,
+        loss=misfits[best],
+        misfit=misfits[best],
+        competing=poses,
+        competes=turned_apart(poses, best, TURNED_DEG) & nearly_as_good(costs + doubt, best),
+    )
+    return rescale(found, radius)
 
 
-def lifted(
-    poses: jaxlie.SE3, offset: Float[Array, "3"], config: RegistrationConfig, upright: bool
-) -> Float[Array, " k"]:
-    """What it costs to be at another height than before: upright objects of scans in one frame stand on the floor."""
-    height = jnp.abs(poses.translation()[:, 2] - offset[2])
-    weight = config.lift_weight if upright and config.identity_start else 0.0
-    return weight * jnp.minimum(height / LIFTED, 1.0)
+def truncations(settings: SurfaceRegistration) -> tuple[float, float]:
+    """The near and the far distance at which misfits are truncated."""
+    return (FINE * settings.search.truncation, settings.search.truncation)
 
 
-def freed(
-    poses: jaxlie.SE3, pair: Pair, source: Surface, target: Surface, config: RegistrationConfig
-) -> Float[Array, " k"]:
-    """What it costs to lie where the other cloud's sensors looked through: of both clouds, the share that does."""
-    sights = ((pair.target_sight, source, lambda T: T), (pair.source_sight, target, lambda T: T.inverse()))
-    cost = jnp.zeros(poses.wxyz_xyz.shape[0])
-    for sight, surface, way in sights if config.free_weight else ():
-        if sight is None:
-            continue
-        cloud = surface.sampled
-
-        def share(T: jaxlie.SE3, sight: Sight = sight, cloud: Sampled = cloud, way: Way = way) -> Array:
-            return looked_through(sight, transformed(way(T), cloud.points), cloud.mask, CLEARLY)
-
-        cost += config.free_weight / 2 * jax.vmap(share)(poses)
-    return cost
+def finalists(
+    costs: Float[Array, " k"], poses: jaxlie.SE3, settings: SurfaceRegistration
+) -> Int[Array, " f"]:
+    """The poses to choose from: the best, each turned otherwise, and "it did not move" (the last) where it is tried."""
+    rest = len(costs) - settings.try_stayed
+    rotation = jax.tree.map(lambda x: x[:rest], poses).rotation()
+    best = lowest_apart(costs[:rest], rotation, min(settings.choose_among, rest))
+    return jnp.append(best, len(costs) - 1) if settings.try_stayed else best
 
 
-def prior_doubts(
+def prior_cost(
     prior: Prior,
     poses: jaxlie.SE3,
     costs: Float[Array, " k"],
-    pair: Pair,
-    whole: Sequence[Surface],
-    config: RegistrationConfig,
+    objects: tuple[AlignableObject, AlignableObject],
+    settings: SurfaceRegistration,
 ) -> Float[Array, " k"]:
-    """`doubts` of both ways' mean; none where the prior is not asked."""
-    if not config.field_weight:
+    """What the prior adds to the costs of poses; nothing where it is not asked."""
+    weight = settings.search.field_weight
+    if not weight:
         return jnp.zeros_like(costs)
-    few = [thinned(s, config.sdf_points) for s in whole]
-    return doubts(costs, off_fields(prior, poses, pair, few).mean(axis=1), config.field_weight)
-
-
-def doubts(costs: Float[Array, " k"], off: Float[Array, " k"], weight: float) -> Float[Array, " k"]:
-    """What the prior adds to the costs of poses: it tells those apart that fit about as well, and has no say beyond."""
-    return weight * jnp.where(costs <= costs.min() + ABOUT_AS_WELL, off, 1.0)
-
-
-def off_fields(
-    prior: Prior, poses: jaxlie.SE3, pair: Pair, surfaces: Sequence[Surface]
-) -> Float[Array, "k 2"]:
-    """Of every pose, how far the source's sample lies from the surface that the prior gives the target, and the
-    target's from that of the source: 0 on it, 1 `OFF_FIELD` away. A pose that is not finite has 1."""
-    source, target = (s.sampled for s in surfaces)
-
-    def both_ways(T: jaxlie.SE3) -> Float[Array, "2"]:
-        there = off_field(prior, T, source, pair.target_code)
-        return jnp.stack([there, off_field(prior, T.inverse(), target, pair.source_code)])
-
-    return jax.vmap(both_ways)(poses)
-
-
-def off_field(prior: Prior, T: jaxlie.SE3, cloud: Sampled, code: Embedding) -> Float[Array, ""]:
-    """How far a moved sample lies off the completed surface of `code`, as in `off_fields`."""
-    distance = jnp.abs(field_sdf(prior, object_field(prior, code), transformed(T, cloud.points)))
-    share = jnp.where(cloud.mask, jnp.minimum(distance / OFF_FIELD, 1.0), 0.0)
-    mean = share.sum() / jnp.maximum(cloud.mask.sum(), 1)
-    return jnp.where(jnp.isfinite(mean), mean, 1.0)
-
-
-def lowest_apart(cost: Float[Array, " n"], rotation: jaxlie.SO3, count: int) -> Int[Array, " count"]:
-    """Indices of the `count` lowest costs whose rotations are at least `APART_DEG` from one another.
-
-    Many starts end in the same place; without this the few kept would be copies of one pose.
-    """
-
-    def body(cost: Array, _: None) -> tuple[Array, Array]:
-        best = jnp.argmin(cost)
-        # ⟨q, q'⟩ = cos of half the angle between two rotations, either sign.
-        half = jnp.abs(rotation.wxyz @ rotation.wxyz[best])
-        return jnp.where(half > jnp.cos(jnp.deg2rad(APART_DEG) / 2), jnp.inf, cost), best
-
-    return jax.lax.scan(body, cost, length=count)[1]
-
-
-def polished(
-    T: jaxlie.SE3,
-    whole: Sequence[Surface],
-    before: Float[Array, ""],
-    config: RegistrationConfig,
-    upright: bool,
-) -> jaxlie.SE3:
-    """The pose aligned with more points and a short reach; as it was if that makes it fit worse."""
-    source, target = (thinned(s, config.polish_points) for s in whole)
-    reach = (config.last_reach, config.polish_reach)
-    finer = align(T, source, target, reach, config.polish_steps, upright)
-    fit = misfit(finer, source, target, (FINE * config.truncation, config.truncation))
-    return jax.tree.map(lambda x, y: jnp.where(fit <= before * STAYED_RATIO + STAYED_OFFSET, x, y), finer, T)
-
-
-def join(a: jaxlie.SE3, b: jaxlie.SE3) -> jaxlie.SE3:
-    """Both batches of poses."""
-    return jax.tree.map(lambda x, y: jnp.concatenate([x, y]), a, b)
-
-
-def misfit(
-    T: jaxlie.SE3, source: Surface, target: Surface, truncations: tuple[float, ...]
-) -> Float[Array, ""]:
-    """Mean truncated distance both ways, as a share of the truncation; 1 if the pose is not finite."""
-    there, back = misfits_both_ways(T, source, target, truncations)
-    return (there + back) / 2
-
-
-def misfits_both_ways(
-    T: jaxlie.SE3, source: Surface, target: Surface, truncations: tuple[float, ...]
-) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Mean truncated distance of the source's points and of the target's, as shares of the truncation.
-
-    Of several truncations the mean: a far one sees the whole object, a near one a handle. Of a point near the other
-    cloud it is mostly the distance off its surface: that to the nearest point has the spacing of points for a floor,
-    under which details disappear. 1 if the pose is not finite.
-    """
-    c = correspondences(T, source, target)
-    gap, count = c.target - c.source, len(source.normals)
-    off = sum(jnp.sum(gap * normal, axis=-1) ** 2 for normal in (c.source_normal, c.target_normal)) / 2
-    near = (1 - POINT_SHARE) * off + POINT_SHARE * c.squared
-    real, finite = c.squared < FAR, jnp.isfinite(T.wxyz_xyz).all()
-    shares = jnp.zeros_like(near)
-    for limit in truncations:
-        squared = jnp.where(c.squared < limit**2, near, c.squared)
-        shares += jnp.minimum(jnp.sqrt(squared + 1e-12) / limit, 1.0) / len(truncations)
-
-    def mean(share: Array, real: Array) -> Array:
-        value = jnp.where(real, share, 0.0).sum() / jnp.maximum(real.sum(), 1)
-        return jnp.where(finite & jnp.isfinite(value), value, 1.0)
-
-    return mean(shares[:count], real[:count]), mean(shares[count:], real[count:])
+    source, target = (thinned(o.whole, settings.field_points).sampled for o in objects)
+    off = off_fields(prior, poses, (source, target), (objects[0].code, objects[1].code))
+    return field_cost(costs, off.mean(axis=1), weight)
 
 
 def choose(costs: Float[Array, " k"], stayed_is_last: bool, doubt: Float[Array, " k"] | float = 0.0) -> Array:
@@ -263,9 +174,37 @@ def choose(costs: Float[Array, " k"], stayed_is_last: bool, doubt: Float[Array, 
     return jnp.argmin(costs + doubt)
 
 
-def competing(poses: jaxlie.SE3, misfits: Float[Array, " k"], best: Array) -> Bool[Array, " k"]:
-    """Which poses explain the clouds about as well as the best, yet turn the object otherwise: its symmetry."""
-    q = poses.rotation().wxyz
-    half = jnp.abs(q @ q[best])
-    apart = half < jnp.cos(jnp.deg2rad(TURNED_DEG) / 2)
-    return apart & (misfits <= misfits[best] * STAYED_RATIO + STAYED_OFFSET)
+def nearly_as_good(costs: Float[Array, " k"], best: Array) -> Bool[Array, " k"]:
+    """Which poses explain the clouds about as well as the best."""
+    return costs <= costs[best] * STAYED_RATIO + STAYED_OFFSET
+
+
+def polished(
+    T: jaxlie.SE3,
+    objects: tuple[AlignableObject, AlignableObject],
+    before: Float[Array, ""],
+    settings: SurfaceRegistration,
+    motion: MotionModel,
+) -> jaxlie.SE3:
+    """The pose aligned with more points and a short reach; as it was if that makes it fit worse."""
+    source, target = (thinned(o.whole, settings.polish_points) for o in objects)
+    reach = (settings.last_reach, settings.polish_reach)
+    finer = align(T, source, target, reach, settings.polish_steps, motion)
+    fit = misfit(finer, source, target, truncations(settings))
+    return jax.tree.map(lambda x, y: jnp.where(fit <= before * STAYED_RATIO + STAYED_OFFSET, x, y), finer, T)
+
+
+def scored(
+    T: jaxlie.SE3, source: Surface, target: Surface, settings: SurfaceRegistration, motion: MotionModel
+) -> Registration:
+    """The record of a pose: residual, covariance, and whether it has settled."""
+    rms = two_way_rms(transform(source.sampled, T), target.sampled, settings.trim)
+    last = align_step(T, source, target, jnp.asarray(settings.last_reach), motion)
+    still = jnp.linalg.norm((last @ T.inverse()).log()) < STILL
+    return Registration(
+        T_target_source=T,
+        loss=rms,
+        rms_m=jnp.where(jnp.isfinite(rms), rms, jnp.inf),
+        converged=still & (rms < settings.converged_rms),
+        covariance=pose_covariance(T, source, target, settings.last_reach, motion),
+    )

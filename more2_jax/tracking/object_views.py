@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
@@ -10,7 +9,7 @@ from jaxtyping import Float
 
 from more2_jax.geometry.free_space import sight_of, spread, stacked, view_of
 from more2_jax.geometry.poses import Points, apply_pose
-from more2_jax.geometry.transform import moved_sight
+from more2_jax.geometry.transform import transform
 from more2_jax.tracking.objects import accumulated, accumulated_points, points_of
 from more2_jax.types import Instance, Observation, Scan, ScanRecord, SceneObject, Sight
 
@@ -22,19 +21,19 @@ def few_sensors(scan: Scan) -> Points:
     return scan.sensors[:: max(1, -(-len(scan.sensors) // SENSORS))]
 
 
-def instances_with_sight(instances: Sequence[Instance], scan: Scan, background: Points) -> list[Instance]:
-    """The instances with what the scan's sensors saw around each. `background`: as the scene remembers it."""
+def instance_sights(instances: Sequence[Instance], scan: Scan, background: Points) -> list[Sight | None]:
+    """What the scan's sensors saw around each instance, in its frame. `background`: as the scene remembers it."""
     if not len(scan.sensors):
-        return list(instances)
+        return [None] * len(instances)
     room = np.concatenate([*(i.points for i in scan.instances), background])
     sensors = few_sensors(scan)
-    return [dataclasses.replace(i, sight=sight_of(i.points, room, sensors)) for i in instances]
+    return [sight_of(i.points, room, sensors) for i in instances]
 
 
-def objects_with_sight(objects: Sequence[SceneObject], scans: Sequence[ScanRecord]) -> list[SceneObject]:
-    """The objects with what was seen around each, in its own frame, by the scans that make up its shape."""
+def object_sights(objects: Sequence[SceneObject], scans: Sequence[ScanRecord]) -> list[Sight | None]:
+    """What was seen around each object, in its own frame, by the scans that make up its shape."""
     rooms = {s.index: _room(s, objects) for s in scans if len(s.sensors)}
-    return [dataclasses.replace(o, sight=_object_sight(o, scans, rooms)) for o in objects]
+    return [_object_sight(o, scans, rooms) for o in objects]
 
 
 def _room(scan: ScanRecord, objects: Sequence[SceneObject]) -> Points:
@@ -51,7 +50,7 @@ def _object_sight(o: SceneObject, scans: Sequence[ScanRecord], rooms: dict[int, 
     for seen, eye in (eyes[k] for k in spread(around, accumulated_points(o).mean(axis=0))):
         view = view_of(points_of(o, seen), rooms[seen.scan], eye)
         if view is not None:
-            views.append(moved_sight(view, seen.T_ref_scan))
+            views.append(transform(view, seen.T_ref_scan))
     return stacked(views)
 
 

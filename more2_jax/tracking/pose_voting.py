@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
+from more2_jax.config import MotionModel
 from more2_jax.geometry.poses import Points, Pose, apply_pose
 
 NEAR_M = 0.1  # votes that agree bring an object's mean this near, or nearer
@@ -76,19 +77,19 @@ def agreement(T: Pose, votes: Votes) -> tuple[int, float]:
     return count, count + float((np.where(near, 0.1 + alike, 0.0) * (1 - gap / NEAR_M))[near].sum()) / 100
 
 
-def most_agreed(votes: Votes, upright: bool, given: Pose) -> Pose:
+def most_agreed(votes: Votes, motion: MotionModel, given: Pose) -> Pose:
     """The frame that most objects agree on; `given` unless clearly more agree on another."""
     ways = votes.T_scene_scan.reshape(-1, 4, 4)
     if len(votes.center) < FEWEST:
         return given
     best = max(ways, key=lambda T: agreement(T, votes)[1])
-    best = estimate(best, votes, upright).T_scene_scan
+    best = estimate(best, votes, motion).T_scene_scan
     count, before = agreement(best, votes)[0], agreement(given, votes)[0]
     return best if count >= max(FEWEST, TIMES * before + 1) else given
 
 
 def estimate(
-    T: Pose, votes: Votes, upright: bool, sigma_m: Float[np.ndarray, " p"] | None = None
+    T: Pose, votes: Votes, motion: MotionModel, sigma_m: Float[np.ndarray, " p"] | None = None
 ) -> Estimate:
     """The frame near `T` that fits the votes best; what moved loses its weight. `sigma_m`: errors of the votes."""
     error = np.full(len(votes.center), 0.01) if sigma_m is None else np.hypot(sigma_m, 0.003)
@@ -98,9 +99,9 @@ def estimate(
         trust = np.where(gap < NEAR_M, (scale**2 / (scale**2 + gap**2)) ** 2, 0.0)
         if not trust.any():
             break
-        T = best_motion(way, votes.center, trust / error**2, alike, upright)
+        T = best_motion(way, votes.center, trust / error**2, alike, motion)
         scale = max(SCALE_M, scale * 0.7)
-    return with_errors(T, votes, upright)
+    return with_errors(T, votes, motion)
 
 
 def best_motion(
@@ -108,7 +109,7 @@ def best_motion(
     center: Float[np.ndarray, "p 3"],
     weight: Float[np.ndarray, " p"],
     alike: Bool[np.ndarray, " p"],
-    upright: bool,
+    motion: MotionModel,
 ) -> Pose:
     """The motion that puts means (and, where turns agree, points about them) where the pairs' own poses do."""
     arms = np.concatenate([np.zeros((1, 3)), ARM_M * np.eye(3), -ARM_M * np.eye(3)])
@@ -118,7 +119,7 @@ def best_motion(
     a, b = a.reshape(-1, 3), b.reshape(-1, 3)
     mean_a, mean_b = w @ a, w @ b
     T = np.eye(4)
-    if upright:
+    if motion == "upright":
         H = (a - mean_a).T @ (w[:, None] * (b - mean_b))
         angle = np.arctan2(H[0, 1] - H[1, 0], H[0, 0] + H[1, 1])
         T[:3, :3] = Rotation.from_euler("z", angle).as_matrix()
@@ -128,7 +129,7 @@ def best_motion(
     return T
 
 
-def with_errors(T: Pose, votes: Votes, upright: bool) -> Estimate:
+def with_errors(T: Pose, votes: Votes, motion: MotionModel) -> Estimate:
     """The frame with what the scatter of the agreeing votes says of its errors."""
     gap, way, alike = nearest_way(T, votes)
     near = gap < NEAR_M
@@ -136,12 +137,13 @@ def with_errors(T: Pose, votes: Votes, upright: bool) -> Estimate:
     cost = float((gap**2 / (SCALE_M**2 + gap**2)).mean()) if len(gap) else 1.0
     at = apply_pose(T, votes.center)
     middle = trust @ at / trust.sum() if trust.any() else np.zeros(3)
-    free = np.array([1, 1, 1, not upright, not upright, 1], bool)
+    turns_freely = motion == "free"
+    free = np.array([1, 1, 1, turns_freely, turns_freely, 1], bool)
     H = np.zeros((6, 6))
     for p, w, turned in zip(at - middle, trust, alike, strict=True):
         J = np.hstack([np.eye(3), -np.cross(np.eye(3), p)])
         H += w * (J.T @ J + turned * np.diag([0, 0, 0, 1, 1, 1]) * ARM_M**2)
-    known = 3 * trust.sum() + alike @ trust * (1 if upright else 3) - free.sum()
+    known = 3 * trust.sum() + alike @ trust * (3 if turns_freely else 1) - free.sum()
     left = trust @ (gap**2 + alike * (ARM_M * np.deg2rad(turns_deg(way[:, :3, :3], T[:3, :3]))) ** 2)
     variance = left / known if known > 0 else np.inf
     covariance = np.zeros((6, 6))

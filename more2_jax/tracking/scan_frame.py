@@ -10,10 +10,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from more2_jax.config import SceneConfig
-from more2_jax.geometry.poses import Points, Pose, apply_pose
-from more2_jax.geometry.transform import lift
-from more2_jax.matching.candidates import PairFits, fit_pairs
+from more2_jax.config import EvidenceMatcher, MotionModel
+from more2_jax.geometry.poses import Points, Pose, apply_pose, vertical_shift
+from more2_jax.matching.candidates import align_candidates, odds_of
 from more2_jax.network.prior import Prior
 from more2_jax.tracking.pose_voting import (
     FEWEST,
@@ -25,7 +24,7 @@ from more2_jax.tracking.pose_voting import (
     room_misfit,
     with_errors,
 )
-from more2_jax.tracking.scan_height import Rooms, common_height
+from more2_jax.tracking.scan_height import Rooms, Weighed, common_height
 from more2_jax.types import Frame, ObservedObject
 
 GIVEN_M = 0.01  # by more than this a frame as given is off where another takes its place,
@@ -37,27 +36,31 @@ def common_frame(
     prior: Prior,
     old: Sequence[ObservedObject],
     new: Sequence[ObservedObject],
-    config: SceneConfig,
+    matcher: EvidenceMatcher,
+    motion: MotionModel,
     rooms: Rooms,
-) -> tuple[Frame, PairFits]:
+) -> tuple[Frame, Weighed]:
     """The frame of a new scan, and how its instances (`new`, own frame) then fit the objects (`old`, scene's)."""
-    height, fits = common_height(prior, old, new, config, rooms) if config.upright else (0.0, None)
-    fits = fits or fit_pairs(prior, old, new, config)
-    lifted = lift(height)
-    pairs = np.argwhere(fits.odds > 0)
+    if motion == "upright":
+        weighed = common_height(prior, old, new, matcher, rooms)
+    else:
+        aligned = align_candidates(prior, old, new, matcher, motion)
+        weighed = Weighed(height_m=0.0, aligned=aligned, odds=odds_of(aligned, matcher.search, motion))
+    lifted = vertical_shift(weighed.height_m)
+    pairs = np.argwhere(weighed.odds > 0)
     votes = Votes(
-        T_scene_scan=fits.T_old_new[tuple(pairs.T)] @ lifted,
-        center=np.stack([k.points.mean(axis=0) for k in new])[pairs[:, 1]],
+        T_scene_scan=weighed.aligned.T_old_new[[weighed.aligned.row_of(k, i) for k, i in pairs]],
+        center=np.stack([o.points.mean(axis=0) for o in new])[pairs[:, 1]],
         object=pairs[:, 0],
         instance=pairs[:, 1],
     )
-    T = most_agreed(votes, config.upright, lifted)
+    T = most_agreed(votes, motion, lifted)
     misfit, before = (room_misfit(x, rooms.scene, rooms.scan) for x in (T, lifted))
-    return Frame(T_scene_scan=T if misfit <= ROOM_WORSE * before else lifted), fits
+    return Frame(T_scene_scan=T if misfit <= ROOM_WORSE * before else lifted), weighed
 
 
 def settled_frame(
-    frame: Frame, places: Sequence[Pose], centers: Points, sigma_m: Sequence[float], upright: bool
+    frame: Frame, places: Sequence[Pose], centers: Points, sigma_m: Sequence[float], motion: MotionModel
 ) -> Frame:
     """The frame by least squares over registered pairs: those that agree with it stayed, as far as is known.
 
@@ -66,8 +69,8 @@ def settled_frame(
     """
     every = np.arange(len(places))
     votes = Votes(T_scene_scan=np.stack(places)[:, None], center=centers, object=every, instance=every)
-    given = with_errors(frame.T_scene_scan, votes, upright)
-    found = estimate(frame.T_scene_scan, votes, upright, np.asarray(sigma_m))
+    given = with_errors(frame.T_scene_scan, votes, motion)
+    found = estimate(frame.T_scene_scan, votes, motion, np.asarray(sigma_m))
     here, there = (apply_pose(x.T_scene_scan, centers) for x in (given, found))
     apart = float(np.sqrt(np.mean(np.sum((here - there) ** 2, axis=1))))
     as_given = np.array_equal(frame.T_scene_scan, np.eye(4))

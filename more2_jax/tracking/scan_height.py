@@ -1,4 +1,4 @@
-"""TODO"""
+"""The common height of two scans of upright things: by floors, tops and bottoms, and by what then fits."""
 
 from __future__ import annotations
 
@@ -8,25 +8,26 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Float
 
-from more2_jax.config import SceneConfig
+from more2_jax.config import EvidenceMatcher
 from more2_jax.geometry.floor import floor_height
-from more2_jax.geometry.poses import Points
-from more2_jax.geometry.transform import lift, moved
-from more2_jax.matching.assignment import assign
-from more2_jax.matching.candidates import PairFits, compared, fit_pairs, heights, proposal_of
+from more2_jax.geometry.poses import Points, vertical_shift
+from more2_jax.matching.assignment import LogOdds, assign
+from more2_jax.matching.candidates import (
+    AlignedPairs,
+    align_candidates,
+    compared,
+    heights,
+    odds_of,
+    proposal_of,
+)
 from more2_jax.network.prior import Prior
 from more2_jax.types import ObservedObject
 
 SPREAD_M = 0.015  # of the votes for a height
-
-
 AS_GOOD_VOTES = 0.8  # share of the most votes at which heights that agree are not doubted
-
-
 CLEARLY = 3.0  # of log odds over a scene: what a change of height must explain beyond none at all
-
-
 LEAST_M = 0.005  # a smaller lift is none
+OUT_OF_REACH_M = 0.1  # an alignment begun at another height finds its own from nearer than this
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,62 +38,78 @@ class Rooms:
     scan: Points = field(default_factory=lambda: np.zeros((0, 3)))
 
 
+@dataclass(frozen=True, kw_only=True)
+class Weighed:
+    """Aligned pairs, and how likely each is one object at the height that explains the scans best."""
+
+    height_m: float  # to be added to the new scan's heights
+    aligned: AlignedPairs
+    odds: LogOdds
+
+    @property
+    def explained(self) -> float:
+        """Log odds of the likeliest assignment against no pair at all."""
+        pairs = assign(self.odds, np.zeros(self.odds.shape), 0.0)
+        return float(self.odds[tuple(pairs.T)].sum())
+
+
 def common_height(
     prior: Prior,
     old: Sequence[ObservedObject],
     new: Sequence[ObservedObject],
-    config: SceneConfig,
+    matcher: EvidenceMatcher,
     rooms: Rooms,
-) -> tuple[float, PairFits]:
-    """What to add to a scan's heights, meters, and how pairs then fit: the lift that explains the scans best.
+) -> Weighed:
+    """The lift of a new scan that explains both scans best, and how pairs then fit; upright.
 
-    Nothing, unless most tops and bottoms of likely pairs agree on something else, and pairs fit clearly better.
+    No lift, unless most tops and bottoms of likely pairs, or the floors, agree on something else and pairs fit
+    clearly better. Pairs are aligned once; again only for a lift too large for an alignment to find from where it was.
     """
-    votes, weights = height_votes(old, new, config)
-    none = fit_pairs(prior, old, new, config)
-    candidates = {best_vote(votes, weights)} if doubtful(votes, weights) else set()
+    votes, weights = height_votes(old, new, matcher)
+    heights_m = {best_vote(votes, weights)} if doubtful(votes, weights) else set()
     floors = [floor_height(p) for p in (rooms.scene, rooms.scan)]
     if floors[0] is not None and floors[1] is not None:
-        candidates.add(floors[0] - floors[1])
-    best, height = none, 0.0
-    for lifted_m in sorted(c for c in candidates if abs(c) > LEAST_M):
-        found, fits = settled(prior, old, new, config, lifted_m)
-        margin = CLEARLY if height == 0.0 else 0.0
-        if explained(fits) > explained(best) + margin:
-            best, height = fits, found
-    return height, best
+        heights_m.add(floors[0] - floors[1])
+    aligned = align_candidates(prior, old, new, matcher, "upright")
+    best = weighed_at(aligned, matcher, 0.0)
+    for height_m in sorted(h for h in heights_m if abs(h) > LEAST_M):
+        if abs(height_m) > OUT_OF_REACH_M:
+            T = vertical_shift(height_m)
+            aligned_there = align_candidates(prior, old, new, matcher, "upright", T)
+        else:
+            aligned_there = aligned
+        found = settled_height(aligned_there, matcher, height_m)
+        margin = CLEARLY if best.height_m == 0.0 else 0.0
+        if found.explained > best.explained + margin:
+            best = found
+    return best
 
 
-def settled(
-    prior: Prior,
-    old: Sequence[ObservedObject],
-    new: Sequence[ObservedObject],
-    config: SceneConfig,
-    height_m: float,
-) -> tuple[float, PairFits]:
-    """A height corrected by the pairs that it makes fit, and how they fit then."""
-    fits = fit_pairs(prior, old, [moved(k, lift(height_m)) for k in new], config)
-    pairs = assign(fits.odds, np.zeros(fits.odds.shape), 0.0)
+def weighed_at(aligned: AlignedPairs, matcher: EvidenceMatcher, height_m: float) -> Weighed:
+    """The aligned pairs at one height."""
+    odds = odds_of(aligned, matcher.search, "upright", height_m)
+    return Weighed(height_m=height_m, aligned=aligned, odds=odds)
+
+
+def settled_height(aligned: AlignedPairs, matcher: EvidenceMatcher, height_m: float) -> Weighed:
+    """A height corrected by the pairs that it makes fit, where that explains more."""
+    first = weighed_at(aligned, matcher, height_m)
+    pairs = assign(first.odds, np.zeros(first.odds.shape), 0.0)
     if len(pairs) < 2:
-        return height_m, fits
-    more = float(np.median(fits.T_old_new[pairs[:, 0], pairs[:, 1], 0, 2, 3]))
-    if not LEAST_M < abs(more) < 0.1:
-        return height_m, fits
-    again = fit_pairs(prior, old, [moved(k, lift(height_m + more)) for k in new], config)
-    return (height_m + more, again) if explained(again) > explained(fits) else (height_m, fits)
-
-
-def explained(fits: PairFits) -> float:
-    """Log odds of the likeliest assignment against no pair at all."""
-    pairs = assign(fits.odds, np.zeros(fits.odds.shape), 0.0)
-    return float(fits.odds[tuple(pairs.T)].sum())
+        return first
+    rows = [aligned.row_of(k, i) for k, i in pairs]
+    corrected_m = float(np.median(aligned.T_old_new[rows, 0, 2, 3]))
+    if not LEAST_M < abs(corrected_m - height_m) < OUT_OF_REACH_M:
+        return first
+    again = weighed_at(aligned, matcher, corrected_m)
+    return again if again.explained > first.explained else first
 
 
 def height_votes(
-    old: Sequence[ObservedObject], new: Sequence[ObservedObject], config: SceneConfig
+    old: Sequence[ObservedObject], new: Sequence[ObservedObject], matcher: EvidenceMatcher
 ) -> tuple[Float[np.ndarray, " v"], Float[np.ndarray, " v"]]:
     """Differences of the bottoms and of the tops of likely pairs, meters, and their weights."""
-    proposal = proposal_of(compared(old, new), config)
+    proposal = proposal_of(compared(old, new), matcher)
     ranks = [np.argsort(np.argsort(-proposal, axis=a), axis=a) for a in (0, 1)]
     weight = sum(0.5**r for r in ranks)
     differences = [a[:, None] - b for a, b in zip(heights(old), heights(new), strict=True)]

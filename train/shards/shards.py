@@ -30,7 +30,7 @@ EXCLUDED = "excluded.json"
 
 @pytree
 class Shapes:
-    """Training shapes in canonical units (centerd, longest edge 0.9), float16."""
+    """Training shapes in canonical units (centered, longest edge 0.9), float16."""
 
     views: Float[Array, "shapes views n 3"]  # back-projected depth maps
     sdf_uniform: Float[Array, "shapes q 4"]  # x y z and signed distance, negative inside

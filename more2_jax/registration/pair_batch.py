@@ -1,0 +1,118 @@
+"""Objects and pairs of objects as the device sees them: padded once, each about an origin of its own."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array, Float, Int
+
+from more2_jax.geometry.free_space import padded_sights
+from more2_jax.geometry.padding import MAX_POINTS, bucket, pad_batch, pad_clouds
+from more2_jax.geometry.poses import local_poses, world_poses
+from more2_jax.registration.search import AlignableObject
+from more2_jax.types import Embedding, LocalBatch, ObservedObject, PointCloud, Sight, pytree, quantity
+
+
+@pytree
+class PairBatch:
+    """Pairs of objects: row i of `source` is to be moved onto row i of `target`."""
+
+    source: LocalBatch = quantity("record")
+    target: LocalBatch = quantity("record")
+    stayed: jaxlie.SE3 = quantity("pose")  # (*batch,): "it did not move", source's local frame to target's
+    # (*batch, k): poses found before, which registration refines; None: it searches for its own.
+    candidates: jaxlie.SE3 | None = quantity("pose", default=None)
+    # Source and target as the search that found the candidates prepared them; None: registration does.
+    prepared: tuple[AlignableObject, AlignableObject] | None = quantity("record", default=None)
+
+    def __len__(self) -> int:
+        return self.source.cloud.points.shape[0]
+
+    def local(self) -> PairBatch:
+        """Without the origins: what compiled programs take."""
+        source, target = (dataclasses.replace(side, origin=None) for side in (self.source, self.target))
+        return dataclasses.replace(self, source=source, target=target)
+
+    def to_world(self, poses: jaxlie.SE3) -> Float[np.ndarray, "*batch 4 4"]:
+        """Poses T_target_source between the scans' own frames, float64, from local ones: (batch,) or (batch, k)."""
+        origins = [np.asarray(side.origin, np.float64) for side in (self.target, self.source)]
+        if len(poses.wxyz_xyz.shape) == 3:
+            origins = [o[:, None] for o in origins]
+        return world_poses(poses, *origins)
+
+
+def pair_up(
+    source: LocalBatch,
+    target: LocalBatch,
+    T_target_source: Float[np.ndarray, "4 4"] | Float[np.ndarray, "b 4 4"] | None = None,
+    candidates: jaxlie.SE3 | None = None,
+) -> PairBatch:
+    """Row i of `source` with row i of `target`.
+
+    `T_target_source`: how the source's scan lies in the target's frame, so where an object is that did not move; by
+    default both scans share a frame. `candidates` (b, k) are local poses. Raises ValueError when the batches differ.
+    """
+    sizes = [len(x) for side in (source, target) for x in (side.cloud.points, side.code.scale)]
+    if len(set(sizes)) != 1:
+        raise ValueError(f"pair_up got {sizes} clouds and codes of sources and targets; needed equal numbers")
+    if isinstance(source.origin, Tracer) or isinstance(target.origin, Tracer):
+        shift = jnp.asarray(source.origin) - jnp.asarray(target.origin)
+        stayed = jaxlie.SE3.from_rotation_and_translation(jaxlie.SO3.identity((len(shift),)), shift)
+        return PairBatch(source=source, target=target, stayed=stayed, candidates=candidates)
+    T = np.broadcast_to(np.eye(4) if T_target_source is None else T_target_source, (sizes[0], 4, 4))
+    stayed = local_poses(T, np.asarray(target.origin), np.asarray(source.origin))
+    return PairBatch(source=source, target=target, stayed=stayed, candidates=candidates)
+
+
+def local_batch(objects: Sequence[ObservedObject], size: int | None = None) -> LocalBatch:
+    """Objects as one batch of one shape for all scenes: (size, `MAX_POINTS`, 3), on the host.
+
+    Fillers repeat the first object; `size` is by default the next power of two.
+    """
+    cloud = pad_batch(pad_clouds([o.points for o in objects], MAX_POINTS), size or bucket(len(objects)))
+    origin = np.asarray(cloud.origin)
+    rows = [objects[k if k < len(objects) else 0].embedding for k in range(len(origin))]
+    code = jax.tree.map(lambda *x: np.stack(x), *rows)
+    return batch_of(jax.tree.map(np.asarray, cloud), code, padded_sights([o.sight for o in objects], origin))
+
+
+def batch_of(cloud: PointCloud, code: Embedding, sight: Sight | None = None) -> LocalBatch:
+    """Clouds and their codes about the clouds' origins; `sight` (from `padded_sights`) is about them already."""
+    return LocalBatch(
+        cloud=dataclasses.replace(cloud, origin=None),
+        code=about(code, cloud.origin),
+        sight=sight,
+        origin=cloud.origin,
+    )
+
+
+def about(code: Embedding, origin: Float[Array | np.ndarray, "*b 3"] | None) -> Embedding:
+    """The code relative to another origin, which it then leaves to its batch; host differences are float64."""
+    if code.origin is None or origin is None:
+        return dataclasses.replace(code, origin=None)
+    if isinstance(code.origin, Tracer) or isinstance(origin, Tracer):
+        shift = jnp.asarray(code.origin) - jnp.asarray(origin)
+    else:
+        shift = np.asarray(np.asarray(code.origin, np.float64) - np.asarray(origin), np.float32)
+    return dataclasses.replace(code, center=code.center + shift, origin=None)
+
+
+def take_pairs(pairs: PairBatch, rows: Sequence[int]) -> PairBatch:
+    """The pairs in `rows`, in that order."""
+    at = np.asarray(rows, int)
+    rest = dataclasses.replace(pairs.local(), source=None, target=None)
+    chosen = jax.tree.map(lambda x: x[at], rest)
+    return dataclasses.replace(chosen, source=pairs.source.take(at), target=pairs.target.take(at))
+
+
+def paired_rows(
+    source: LocalBatch, target: LocalBatch, pairs: Int[np.ndarray, "p 2"], T: Float[np.ndarray, "4 4"]
+) -> PairBatch:
+    """The pairs (row of `source`, row of `target`) of two batches; `T` as `pair_up` takes it."""
+    return pair_up(source.take(pairs[:, 0]), target.take(pairs[:, 1]), T)

@@ -1,0 +1,131 @@
+"""The search for a pair's poses: every start aligned by coarse surfaces, the few that fit best kept.
+
+Matching asks it of every candidate pair, and hands the poses it found to registration, which refines them. An object
+is prepared once, whatever number of pairs it is part of.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import jaxlie
+from jaxtyping import Array, Float
+
+from more2_jax.config import MotionModel, SurfaceSearch
+from more2_jax.geometry.point_to_plane import Surface, align, coarsened, whole_surface
+from more2_jax.geometry.points import cloud_radius
+from more2_jax.geometry.transform import rescale
+from more2_jax.network.row_map import chunked
+from more2_jax.registration.pose_costs import (
+    free_space_cost,
+    height_cost,
+    lowest_apart,
+    misfits_both_ways,
+)
+from more2_jax.registration.starting_poses import candidate_poses, masked_mean
+from more2_jax.types import Embedding, LocalBatch, Sight, pytree, quantity
+
+OBJECTS_A_CALL = 8  # prepared together: of few shapes, so that scenes share compiled programs
+PAIRS_A_CALL = 16  # searched together
+
+
+@pytree
+class AlignableObject:
+    """An object ready to be aligned, in its local frame, meters."""
+
+    whole: Surface = quantity("record")  # all of its points, with normals
+    coarse: Surface = quantity("record")  # what a search compares
+    radius: Float[Array, "*b"] = quantity("length")
+    code: Embedding = quantity("record")
+    sight: Sight | None = quantity("record", default=None)
+
+
+@pytree
+class FoundPoses:
+    """The poses of one pair that are worth refining, best first, and how well each fits."""
+
+    poses: jaxlie.SE3 = quantity("pose")  # (*b, k): source's local frame to target's
+    cost: Float[Array, "*b k"] = quantity("invariant")  # by which they are ordered
+    of_source: Float[Array, "*b k"] = quantity("invariant")  # mean truncated distance of its points, and
+    of_target: Float[Array, "*b k"] = quantity("invariant")  # of the target's: 0 none, 1 nothing agrees
+
+
+def alignable(batch: LocalBatch, search: SurfaceSearch) -> AlignableObject:
+    """Every object of a batch with its normals and its coarse surface."""
+    local = LocalBatch(cloud=batch.cloud, code=batch.code, sight=batch.sight)
+    return chunked(partial(_alignable, search=search), OBJECTS_A_CALL, local)
+
+
+@partial(jax.jit, static_argnames="search")
+def _alignable(batch: LocalBatch, search: SurfaceSearch) -> AlignableObject:
+    def one(row: LocalBatch) -> AlignableObject:
+        cloud = row.cloud
+        whole = whole_surface(cloud.points, cloud.mask)
+        coarse = coarsened(whole, search.points, search.dense, search.cells)
+        radius = cloud_radius(cloud.points, cloud.mask)
+        return AlignableObject(whole=whole, coarse=coarse, radius=radius, code=row.code, sight=row.sight)
+
+    return jax.lax.map(one, batch)
+
+
+def search_poses(
+    source: AlignableObject,
+    target: AlignableObject,
+    stayed: jaxlie.SE3,
+    search: SurfaceSearch,
+    motion: MotionModel,
+) -> FoundPoses:
+    """The poses of a batch of pairs, row i of `source` onto row i of `target`; meters, local frames.
+
+    `stayed` (b,): where each source would be had it not moved.
+    """
+    return chunked(
+        partial(_search_poses, search=search, motion=motion), PAIRS_A_CALL, (source, target, stayed)
+    )
+
+
+@partial(jax.jit, static_argnames=("search", "motion"))
+def _search_poses(
+    pairs: tuple[AlignableObject, AlignableObject, jaxlie.SE3], search: SurfaceSearch, motion: MotionModel
+) -> FoundPoses:
+    at_once = 8 if jax.default_backend() == "cpu" else PAIRS_A_CALL  # what fits a small CPU's caches
+
+    def one(pair: tuple[AlignableObject, AlignableObject, jaxlie.SE3]) -> FoundPoses:
+        source, target, stayed = pair
+        return search_pair(source, target, stayed, search, motion)
+
+    return jax.lax.map(one, pairs, batch_size=at_once)
+
+
+def search_pair(
+    source: AlignableObject,
+    target: AlignableObject,
+    stayed: jaxlie.SE3,
+    search: SurfaceSearch,
+    motion: MotionModel,
+) -> FoundPoses:
+    """One pair; works in units of the target's radius. Differentiable, the correspondences held."""
+    radius = target.radius
+    s, t, stayed = rescale(source, 1 / radius), rescale(target, 1 / radius), scaled_pose(stayed, 1 / radius)
+    means = tuple(masked_mean(x.coarse.sampled.points, x.coarse.sampled.mask) for x in (s, t))
+    starts = candidate_poses((s.code, t.code), means, stayed, search.turns, motion)  # type: ignore[arg-type]
+    reach = (search.first_reach, search.last_reach)
+    poses = jax.vmap(lambda T: align(T, s.coarse, t.coarse, reach, search.steps, motion))(starts)
+    there, back = jax.vmap(lambda T: misfits_both_ways(T, s.coarse, t.coarse, (search.truncation,)))(poses)
+    cost = (there + back) / 2 + height_cost(poses, stayed, search, motion)
+    cost += free_space_cost(poses, (s.coarse, t.coarse), (s.sight, t.sight), search, motion)
+    best = lowest_apart(cost, poses.rotation(), min(search.keep, len(cost)))
+    found = FoundPoses(poses=poses, cost=cost, of_source=there, of_target=back)
+    return rescale(jax.tree.map(lambda x: x[best], found), radius)
+
+
+def scaled_pose(T: jaxlie.SE3, factor: Float[Array, ""]) -> jaxlie.SE3:
+    """The pose in other units of length."""
+    return jaxlie.SE3.from_rotation_and_translation(T.rotation(), T.translation() * factor)
+
+
+def concatenated(a: jaxlie.SE3, b: jaxlie.SE3) -> jaxlie.SE3:
+    """Both batches of poses."""
+    return jax.tree.map(lambda x, y: jnp.concatenate([x, y]), a, b)
