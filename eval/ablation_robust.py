@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-import dataclasses
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +17,7 @@ from eval.peers.extra import has
 from eval.peers.registration import many_starts
 from eval.registration import own_records, peer_records, true_pairs
 from eval.scores.figures import Record
-from more2_jax.config import RegistrationConfig, preset
+from more2_jax.config import DescentRegistration, RegistrationMethod, SurfaceRegistration, preset
 from more2_jax.network.prior import load_prior
 from train.run.program import run
 
@@ -41,7 +41,9 @@ def main(
     pairs = [p for s in known for p in true_pairs(s, "first")]
     if not pairs:
         raise ValueError(f"{data}: no object in both of the first two scans; needed one")
-    named = variants(preset("robust", upright=rooms.upright).registration)
+    robust = preset("robust", upright=rooms.upright).registration
+    assert isinstance(robust, SurfaceRegistration)
+    named = variants(robust)
     if unknown := set(only) - set(named):
         raise ValueError(f"variants {sorted(unknown)}; needed some of {', '.join(named)}")
     chosen = {k: v for k, v in named.items() if not only or k in only}
@@ -51,21 +53,27 @@ def main(
     Console().print(table([r for _, r in found], rooms.right_deg))
 
 
-def variants(robust: RegistrationConfig) -> dict[str, RegistrationConfig]:
+def variants(robust: SurfaceRegistration) -> dict[str, RegistrationMethod]:
     """Registration as `robust` has it, and without or with one thing."""
-    changes = {
-        "robust": {},
+    searches = {
         "without the prior's surfaces": {"field_weight": 0.0},
-        "without polish": {"polish_steps": 0},
-        "without 'it did not move'": {"identity_start": False},
         "height is free": {"lift_weight": 0.0},
-        "truncation halved": {"truncation": robust.truncation / 2},
-        "3 starts kept": {"keep_starts": 3},
-        "12 turns to start from": {"yaw_starts": 12},
-        "from the embedding's turn alone": {"starts": "embedding"},
-        "descent on the field": {"refine": "descent", "keep_starts": 3, "steps": 25, "learning_rate": 0.01},
+        "truncation halved": {"truncation": robust.search.truncation / 2},
+        "3 starts kept": {"keep": 3},
+        "12 turns to start from": {"turns": 12},
+        "from the embedding's turn alone": {"turns": 0},
     }
-    return {name: dataclasses.replace(robust, **change) for name, change in changes.items()}
+    changes = {
+        "without polish": {"polish_steps": 0},
+        "without 'it did not move'": {"try_stayed": False},
+        "the prior is asked about one pose more": {"choose_among": robust.choose_among + 1},
+    }
+    return {
+        "robust": robust,
+        **{k: replace(robust, search=replace(robust.search, **change)) for k, change in searches.items()},
+        **{k: replace(robust, **change) for k, change in changes.items()},
+        "descent on the field": DescentRegistration(),
+    }
 
 
 def table(records: list[Record], right_deg: float) -> Table:

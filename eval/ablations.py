@@ -27,10 +27,10 @@ from eval.registration import own_records, own_settings, true_pairs
 from eval.scores.figures import Figure, Record, in_columns
 from eval.scores.mesh_scores import RECONSTRUCTED, mesh_scores
 from eval.scores.pose_scores import pose_scores
-from more2_jax.config import JointConfig, MatchingConfig, SceneConfig
+from more2_jax.config import CodeMatcher, JointConfig, SceneConfig
 from more2_jax.network.prior import Prior
 from more2_jax.refinement.joint_of_objects import repose
-from more2_jax.types import SceneObject
+from more2_jax.types import ObservedObject, SceneObject
 from train.run.program import run
 
 RATES = {
@@ -111,7 +111,7 @@ def matching_study(scenes: Sequence[KnownScene], prior: Prior, o: Settings) -> l
         codes = embed_all(prior, [i.points for s in scene.scans for i in s.instances], o.batch)
         by_scan = [codes[b - len(s.instances) : b] for b, s in zip(counts, scene.scans, strict=True)]
         for name, score in SCORES.items():
-            config = SceneConfig(matching=MatchingConfig(score=score))  # pyright: ignore[reportArgumentType]
+            config = SceneConfig(matching=CodeMatcher(score=score))  # pyright: ignore[reportArgumentType]
             for b in range(1, len(scene.scans)):
                 one, other = scene.scans[0].instances, scene.scans[b].instances
                 matched = match_own(prior, one, by_scan[0], other, by_scan[b], config)
@@ -162,11 +162,14 @@ def registered(
     for clouds in raw:
         own = codes[used : used + len(clouds)]
         pairs += [
-            PairToRegister(source=c, target=clouds[0], source_code=e, target_code=own[0])
+            PairToRegister(
+                source=ObservedObject(points=c, embedding=e),
+                target=ObservedObject(points=clouds[0], embedding=own[0]),
+            )
             for c, e in zip(clouds[1:], own[1:], strict=True)
         ]
         used += len(clouds)
-    poses = iter(register_all(prior, pairs, config.registration, config.upright, batch))
+    poses = iter(register_all(prior, pairs, config.registration, config.motion, batch))
     posed = [
         repose(x, [np.eye(4), *(next(poses) for _ in clouds[1:])])
         for x, clouds in zip(objects, raw, strict=True)

@@ -22,10 +22,10 @@ from scipy.special import expit
 from eval.data.flyingshape import flyingshape
 from eval.data.truth import KnownScene
 from eval.harness.batched import embed_all
-from more2_jax.config import SceneConfig, preset
+from more2_jax.config import EvidenceMatcher, SceneConfig, preset
 from more2_jax.matching.assignment import NEVER, assign
 from more2_jax.matching.calibration import FREE, UNASKED, UNKNOWN, UPRIGHT, Calibration, features, weighed
-from more2_jax.matching.candidates import aligned_candidates
+from more2_jax.matching.candidates import align_candidates, evidence_at
 from more2_jax.matching.pair_evidence import asks_prior
 from more2_jax.network.prior import Prior, load_prior
 from more2_jax.types import Instance, ObservedObject
@@ -85,7 +85,9 @@ def asked(config: SceneConfig) -> dict[str, Calibration]:
     if config.upright:
         return {"UPRIGHT": UPRIGHT}
     return (
-        {"FREE": FREE, "UNASKED": UNASKED} if asks_prior(config.registration, False) else {"UNASKED": UNASKED}
+        {"FREE": FREE, "UNASKED": UNASKED}
+        if asks_prior(evidence_matcher(config).search, "free")
+        else {"UNASKED": UNASKED}
     )
 
 
@@ -109,11 +111,17 @@ def scan_pair(
     one: Bool[np.ndarray, "n m"],
 ) -> ScanPair:
     """Aligns the candidates of two scans."""
-    tried = aligned_candidates(prior, *sides, config)
-    sure = np.asarray(tried.evidence.off_own) <= UNKNOWN
-    return ScanPair(
-        room=room, among=tried.among, known=features(tried.evidence, tried.compared), sure=sure, one=one
-    )
+    matcher = evidence_matcher(config)
+    aligned = align_candidates(prior, *sides, matcher, config.motion)
+    known = features(evidence_at(aligned, matcher.search, config.motion), aligned.compared)
+    return ScanPair(room=room, among=aligned.among, known=known, sure=aligned.off_own <= UNKNOWN, one=one)
+
+
+def evidence_matcher(config: SceneConfig) -> EvidenceMatcher:
+    """The settings of matching. Raises ValueError where surfaces are not compared."""
+    if not isinstance(config.matching, EvidenceMatcher):
+        raise ValueError(f"preset {config.preset!r} matches by codes; needed one that compares surfaces")
+    return config.matching
 
 
 def labels(

@@ -25,11 +25,11 @@ from eval.peers import classifier
 from eval.peers.matching import Matcher, matchers
 from eval.scores.figures import COLUMNS, Figure, Record, in_columns
 from eval.scores.match_scores import match_scores, partners
-from more2_jax.config import MatchingConfig, SceneConfig, preset
+from more2_jax.config import CodeMatcher, EvidenceMatcher, SceneConfig, preset
+from more2_jax.matching.color import color_of
 from more2_jax.network.prior import Prior
-from more2_jax.tracking.identify import match_scan
-from more2_jax.tracking.objects import new_object
-from more2_jax.types import Embedding, Instance
+from more2_jax.tracking.identify import identify
+from more2_jax.types import Embedding, Instance, ObservedObject
 from train.run.program import run
 
 SHARES = (25, 50, 75, 100)  # %: of a scan pair's objects, for scene recall
@@ -81,9 +81,9 @@ def main(options: Annotated[Settings, tyro.conf.arg(name="")]) -> None:
     finish(current, options, FIGURES, records, ("to_scan",))
 
 
-def own_settings(name: str) -> dict[str, MatchingConfig]:
+def own_settings(name: str) -> dict[str, CodeMatcher | EvidenceMatcher]:
     """The preset's own matching, and the embeddings alone: Λ, 1/E, Λ ⊘ E, and Λ as the published code assigns."""
-    plain = MatchingConfig()
+    plain = CodeMatcher()
     return {
         f"ours, {name}": preset(name).matching,
         "Λ ⊘ E": plain,
@@ -152,8 +152,14 @@ def match_own(
     """The package's own matching of two scans: instance → instance."""
     if not one or not other:
         return {}
-    objects = [new_object(k, 0, i, e) for k, (i, e) in enumerate(zip(one, one_codes, strict=True))]
-    found = match_scan(prior, objects, other, other_codes, config).found
+    old, new = (
+        [
+            ObservedObject(points=i.points, embedding=e, color=color_of(i.colors))
+            for i, e in zip(*side, strict=True)
+        ]
+        for side in ((one, one_codes), (other, other_codes))
+    )
+    found = identify(prior, old, new, config).found
     return {one[f.object].id: other[f.instance].id for f in found}
 
 

@@ -25,7 +25,7 @@ from rich.progress import track
 from rich.table import Table
 from scipy.spatial.transform import Rotation
 
-from more2_jax.config import MatchingConfig
+from more2_jax.config import CodeMatcher
 from more2_jax.geometry.points import farthest_points, kabsch_rotation
 from more2_jax.matching.code_assignment import hungarian, score_matrix
 from more2_jax.metrics import bootstrap_ci95, symmetry_aware_rotation_error_deg
@@ -178,7 +178,7 @@ def rotation_error(R: np.ndarray, true: Float[np.ndarray, "2 3 3"], order: int) 
 
 
 @partial(jax.jit, static_argnames="config")
-def matched(codes: Embedding, real: Bool[Array, " n"], config: MatchingConfig) -> Bool[Array, " n"]:
+def matched(codes: Embedding, real: Bool[Array, " n"], config: CodeMatcher) -> Bool[Array, " n"]:
     """Which of a scene's objects the assignment on H = Λ ⊘ E takes to themselves."""
     source, target = (jax.tree.map(lambda x, i=i: x[:, i], codes) for i in (0, 1))
     partner, _ = hungarian(score_matrix(source, target, config), real[:, None] & real[None])
@@ -192,7 +192,7 @@ def matching(codes: Embedding, scenes: int, seed: int) -> dict[str, Any]:
         chosen = rng.choice(len(codes.scale), 8, replace=False)
         real = np.arange(8) < rng.integers(4, 9)
         scene = jax.tree.map(lambda x, c=chosen: x[c], codes)
-        right.append(int(np.sum(matched(scene, real, MatchingConfig()))))
+        right.append(int(np.sum(matched(scene, real, CodeMatcher()))))
         of.append(int(real.sum()))
     share = np.array(right) / np.array(of)
     return figure(share, np.sum(right) / np.sum(of))

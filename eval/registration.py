@@ -26,10 +26,17 @@ from eval.harness.runs import run_scenes, start_run
 from eval.peers.registration import Registrar, registrars
 from eval.scores.figures import Figure, Record, in_columns
 from eval.scores.pose_scores import Pose, pose_scores
-from more2_jax.config import RegistrationConfig, SceneConfig, preset
+from more2_jax.config import (
+    DescentRegistration,
+    MotionModel,
+    RegistrationMethod,
+    SceneConfig,
+    SurfaceRegistration,
+    preset,
+)
 from more2_jax.geometry.free_space import sight_of
 from more2_jax.network.prior import Prior
-from more2_jax.types import Embedding, Scan, Sight
+from more2_jax.types import Embedding, ObservedObject, Scan, Sight
 from train.run.program import run
 
 CLOSED = "laid onto one another"
@@ -121,18 +128,23 @@ def main(options: Annotated[Settings, tyro.conf.arg(name="")]) -> None:
     plot(current.out, records, 3 * data.right_deg)
 
 
-def own_settings(name: str, upright: bool) -> dict[str, RegistrationConfig]:
+def own_settings(name: str, upright: bool) -> dict[str, RegistrationMethod]:
     """The preset's registration; without knowing the sensors; and without what follows the coarse search of starts."""
-    config = preset(name, upright=upright).registration
-    paper = preset("paper", upright=upright).registration
-    blind = dataclasses.replace(config, free_weight=0.0)
+    method = preset(name, upright=upright).registration
+    codes_alone = dataclasses.replace(DescentRegistration(), steps=0, icp_steps=0)
+    if isinstance(method, DescentRegistration):
+        return {
+            f"ours, {name}": method,
+            f"ours, {name}, without optimization": dataclasses.replace(method, steps=0),
+            KABSCH: codes_alone,
+        }
+    blind = dataclasses.replace(method, search=dataclasses.replace(method.search, free_weight=0.0))
+    told = upright and method.search.free_weight > 0
     return {
-        f"ours, {name}": config,
-        **({f"ours, {name}, sensors unknown": blind} if config.free_weight else {}),
-        f"ours, {name}, without optimization": dataclasses.replace(
-            blind, steps=0, surface_steps=0, polish_steps=0
-        ),
-        KABSCH: dataclasses.replace(paper, steps=0, icp_steps=0),
+        f"ours, {name}": method,
+        **({f"ours, {name}, sensors unknown": blind} if told else {}),
+        f"ours, {name}, without optimization": dataclasses.replace(blind, steps=0, polish_steps=0),
+        KABSCH: codes_alone,
     }
 
 
@@ -150,7 +162,7 @@ def true_pairs(scene: KnownScene, which: str = "all") -> list[TruePair]:
 def own_records(
     pairs: Sequence[TruePair],
     prior: Prior,
-    settings: Mapping[str, RegistrationConfig],
+    settings: Mapping[str, RegistrationMethod],
     upright: bool,
     batch: int,
     closed_by: SceneConfig | None = None,
@@ -163,15 +175,23 @@ def own_records(
         return []
     ready, encoding_s, looking_s = ready_pairs(pairs, prior, batch)
     found: list[tuple[str, Record]] = []
-    for name, config in settings.items():
+    motion: MotionModel = "upright" if upright else "free"
+    for name, method in settings.items():
         began = time.perf_counter()
-        poses = register_all(prior, ready, config, upright, batch)
+        poses = register_all(prior, ready, method, motion, batch)
         seconds = encoding_s + (time.perf_counter() - began) / len(pairs)
-        seconds += looking_s if config.free_weight else 0.0
+        told = isinstance(method, SurfaceRegistration) and upright and method.search.free_weight > 0
+        seconds += looking_s if told else 0.0
         found += [scored(p, T, name, seconds) for p, T in zip(pairs, poses, strict=True)]
         if closed_by and closed_by.closing.steps and name == next(iter(settings)):
             found += closed_records(
-                prior, pairs, [p.target_code for p in ready], poses, closed_by, f"{name}, {CLOSED}", seconds
+                prior,
+                pairs,
+                [p.target.embedding for p in ready],
+                poses,
+                closed_by,
+                f"{name}, {CLOSED}",
+                seconds,
             )
     return found
 
@@ -189,12 +209,8 @@ def ready_pairs(
     looking_s = (time.perf_counter() - began) / len(pairs)
     ready = [
         PairToRegister(
-            source=s,
-            target=t,
-            source_code=codes[2 * k],
-            target_code=codes[2 * k + 1],
-            source_sight=sights[k][0],
-            target_sight=sights[k][1],
+            source=ObservedObject(points=s, embedding=codes[2 * k], sight=sights[k][0]),
+            target=ObservedObject(points=t, embedding=codes[2 * k + 1], sight=sights[k][1]),
         )
         for k, (s, t) in enumerate(clouds)
     ]

@@ -1,10 +1,9 @@
 """Where did the chair go? Two partial clouds of one object, and the pose that takes one onto the other.
 
-You learn: `pad_clouds` batches ragged clouds, `encode` gives one embedding a cloud, `register` finds the pose between
-the clouds' local frames, and `world_pose` turns it into a 4×4 pose between the scans' own frames.
+You learn: `observe` pads and encodes clouds, `pair_up` makes pairs of them, `register` finds their poses, and
+`to_world` turns those into 4×4 poses between the scans' own frames.
 """
 
-import jax
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -25,13 +24,10 @@ T_after_before[:3, 3] = [1.5, -0.4, 0.0]
 after = apply_pose(T_after_before, after_unmoved) + rng.normal(scale=0.002, size=after_unmoved.shape)
 
 prior = m2.load_prior("small")
-config = m2.preset("robust", upright=True).registration
-source, target = m2.pad_clouds([before]), m2.pad_clouds([after])
-found = m2.register(
-    prior, source, target, m2.encode(prior, source), m2.encode(prior, target), config, upright=True
-)
-T_local = jax.tree.map(lambda x: x[0], found.T_target_source)  # of the only pair in the batch
-T = m2.world_pose(T_local, target.origin[0], source.origin[0])
+method = m2.preset("robust", upright=True).registration
+pairs = m2.pair_up(m2.observe(prior, [before]), m2.observe(prior, [after]))  # one pair: source, target
+found = m2.register(prior, pairs, method, "upright")
+T = pairs.to_world(found.T_target_source)[0]
 
 center = before.mean(axis=0, keepdims=True)
 off = float(np.linalg.norm(apply_pose(T, center) - apply_pose(T_after_before, center)))

@@ -1,36 +1,26 @@
 """Gradients run from the pose a registration ends with back to the points it was given.
 
-You learn: the stages for one pair (`encode_one`, `register_one`) are plain functions that `jax.grad` differentiates,
-through the encoder, the start by Kabsch, descent on SE(3) and ICP. A central difference confirms the number.
+You learn: `encode` and `register` can be differentiated as they are, through the encoder, the start by Kabsch, descent
+on SE(3) and ICP. A central difference confirms the number.
 """
 
 import jax
 import jax.numpy as jnp
 
 import more2_jax as m2
-from more2_jax.config import RegistrationConfig
-from more2_jax.geometry.points import sample
-from more2_jax.network.prior import encode_one
-from more2_jax.registration.register import register_one
-from more2_jax.registration.starting_poses import Pair
+from more2_jax.config import DescentRegistration
 
 jax.config.update("jax_enable_x64", True)  # finite differences need the digits; gradients alone do not
 
 prior = jax.tree.map(lambda x: x.astype(jnp.float64), m2.load_prior("small"))
-config = RegistrationConfig(points=64, sdf_points=64, steps=5, icp_steps=2)
+method = DescentRegistration(points=64, sdf_points=64, steps=5, icp_steps=2)
 
 
 def loss(source, target):
     """What registration minimizes, at the pose it ends with."""
-    mask = jnp.ones(len(source), bool)
-    pair = Pair(
-        source=sample(source, mask, config.points, dense=False),
-        target=sample(target, mask, config.points, dense=False),
-        source_code=encode_one(prior, source, mask),
-        target_code=encode_one(prior, target, mask),
-        offset=jnp.zeros(3),
-    )
-    return register_one(prior, pair, config, upright=False).loss
+    clouds = [m2.PointCloud(points=x[None], mask=jnp.ones((1, len(x)), bool)) for x in (source, target)]
+    one, other = (m2.batch_of(cloud, m2.encode(prior, cloud)) for cloud in clouds)
+    return m2.register(prior, m2.pair_up(one, other), method).loss[0]
 
 
 keys = jax.random.split(jax.random.key(0), 3)

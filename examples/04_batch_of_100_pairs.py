@@ -1,4 +1,4 @@
-"""A hundred registrations in one compiled call.
+"""A hundred registrations in one call.
 
 You learn: every stage takes a batch. One padded shape means one compiled program, whatever the clouds' sizes; on an
 accelerator the same call fills the device.
@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 import more2_jax as m2
-from more2_jax.config import RegistrationConfig
+from more2_jax.config import SurfaceRegistration, SurfaceSearch
 from more2_jax.geometry.poses import apply_pose, rotation_error_deg
 from more2_jax.scans.demo import demo_scan_paths
 
@@ -31,18 +31,17 @@ for k in range(PAIRS):
 
 prior = m2.load_prior("small")
 # A quick setting: fewer points and steps than the preset `robust`, its many starts kept.
-config = RegistrationConfig(
-    points=64, sdf_points=32, dense=True, starts="many", yaw_starts=24, coarse_points=48, coarse_steps=8,
-    keep_starts=2, steps=4, learning_rate=0.01, icp_steps=8, trim=0.8,
+method = SurfaceRegistration(
+    search=SurfaceSearch(points=48, dense=256, cells=12, steps=8, keep=2, field_weight=0.0),
+    points=64, steps=8, polish_steps=4,
 )  # fmt: skip
-source, target = m2.pad_clouds(before, 256), m2.pad_clouds(after, 256)
-codes = m2.encode(prior, source), m2.encode(prior, target)
+pairs = m2.pair_up(m2.observe(prior, before), m2.observe(prior, after))
 
 
 def register_all():
     """All pairs, and the seconds it took."""
     begin = time.perf_counter()
-    found = jax.block_until_ready(m2.register(prior, source, target, *codes, config, upright=True))
+    found = jax.block_until_ready(m2.register(prior, pairs, method, "upright"))
     return found, time.perf_counter() - begin
 
 

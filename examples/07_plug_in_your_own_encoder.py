@@ -13,6 +13,7 @@ import numpy as np
 
 import more2_jax as m2
 from more2_jax.cli.demo_score import pose_error
+from more2_jax.config import CodeMatcher, SurfaceSearch
 from more2_jax.scans.demo import demo_ground_truth, demo_scan_paths
 from more2_jax.types import Observation
 
@@ -52,8 +53,7 @@ def embed_all(scan: m2.Scan) -> tuple[m2.PointCloud, m2.Embedding]:
 old_scan, new_scan = (m2.read_scan(path) for path in demo_scan_paths()[:2])
 (old, old_codes), (new, new_codes) = embed_all(old_scan), embed_all(new_scan)
 config = m2.preset("robust", upright=True)
-matching = dataclasses.replace(config.matching, size_weight=1.0)
-partner = np.asarray(m2.match_instances(new_codes, old_codes, matching).target_index)
+partner = np.asarray(m2.match_instances(new_codes, old_codes, CodeMatcher(score="inv")).target_index)
 
 truth = demo_ground_truth()
 pairs = [(n, o) for n, o in enumerate(partner) if o >= 0]
@@ -62,22 +62,14 @@ right = [a.model == b.model for a, b in names]
 print(f"matched by the own descriptor alone: {sum(right)} of 6 right, {len(right) - sum(right)} wrong")
 
 rows_new, rows_old = (np.array(side) for side in zip(*pairs, strict=True))
-registration = dataclasses.replace(config.registration, field_weight=0.0)
-found = m2.register(
-    prior,
-    jax.tree.map(lambda x: x[rows_new], new),
-    jax.tree.map(lambda x: x[rows_old], old),
-    jax.tree.map(lambda x: x[rows_new], new_codes),
-    jax.tree.map(lambda x: x[rows_old], old_codes),
-    registration,
-    upright=True,
-)
+registration = dataclasses.replace(config.registration, search=SurfaceSearch(field_weight=0.0))
+batch = m2.pair_up(m2.batch_of(new, new_codes).take(rows_new), m2.batch_of(old, old_codes).take(rows_old))
+found = m2.register(prior, batch, registration, "upright")
+T_old_new = batch.to_world(found.T_target_source)
 errors = []
-for k, (n, o) in enumerate(pairs):
+for k in range(len(pairs)):
     if right[k]:
-        T_local = jax.tree.map(lambda x, k=k: x[k], found.T_target_source)
-        T = m2.world_pose(T_local, np.asarray(old.origin)[o], np.asarray(new.origin)[n])
-        seen = Observation(scan=1, instance=0, T_ref_scan=T, score=1.0, rms_m=0.0, converged=True)
+        seen = Observation(scan=1, instance=0, T_ref_scan=T_old_new[k], score=1.0, rms_m=0.0, converged=True)
         errors.append(pose_error(*names[k], seen, truth)[0])
         print(f"{truth.names[names[k][0].model]}: rotation error {errors[-1]:.1f}°")
 print(f"median rotation error of right matches: {np.median(errors):.1f}°")

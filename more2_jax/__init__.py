@@ -27,7 +27,8 @@ _HOMES = {
     "geometry.points": ("chamfer_distance", "kabsch"),
     "matching.code_assignment": ("match_instances",),
     "registration.register": ("register",),
-    "registration.pair_batch": ("PairBatch", "batch_of", "local_batch", "pair_up"),
+    "registration.older_calls": ("world_pose",),
+    "registration.pair_batch": ("PairBatch", "batch_of", "local_batch", "observe", "pair_up"),
     "meshing.extract": ("extract_mesh",),
     "refinement.joint": ("fit_jointly",),
     "scene": ("add_scan", "reconstruct", "start_scene"),
@@ -44,7 +45,8 @@ if TYPE_CHECKING:
     from more2_jax.meshing.extract import extract_mesh
     from more2_jax.network.prior import Prior, encode, init_prior, load_prior, save_prior, sdf
     from more2_jax.refinement.joint import fit_jointly
-    from more2_jax.registration.pair_batch import PairBatch, batch_of, local_batch, pair_up
+    from more2_jax.registration.older_calls import world_pose
+    from more2_jax.registration.pair_batch import PairBatch, batch_of, local_batch, observe, pair_up
     from more2_jax.registration.register import register
     from more2_jax.scans.read_scan import read_scan
     from more2_jax.scene import add_scan, reconstruct, start_scene
@@ -89,6 +91,7 @@ __all__ = [
     "load_scene",
     "local_batch",
     "match_instances",
+    "observe",
     "pad_clouds",
     "pair_up",
     "preset",
@@ -99,6 +102,7 @@ __all__ = [
     "save_scene",
     "sdf",
     "start_scene",
+    "world_pose",
 ]
 
 

@@ -15,6 +15,7 @@ from jaxtyping import Array, Float, Int
 from more2_jax.geometry.free_space import padded_sights
 from more2_jax.geometry.padding import MAX_POINTS, bucket, pad_batch, pad_clouds
 from more2_jax.geometry.poses import local_poses, world_poses
+from more2_jax.network.prior import Prior, encode
 from more2_jax.registration.search import AlignableObject
 from more2_jax.types import Embedding, LocalBatch, ObservedObject, PointCloud, Sight, pytree, quantity
 
@@ -80,6 +81,15 @@ def local_batch(objects: Sequence[ObservedObject], size: int | None = None) -> L
     rows = [objects[k if k < len(objects) else 0].embedding for k in range(len(origin))]
     code = jax.tree.map(lambda *x: np.stack(x), *rows)
     return batch_of(jax.tree.map(np.asarray, cloud), code, padded_sights([o.sight for o in objects], origin))
+
+
+def observe(prior: Prior, clouds: Sequence[Float[np.ndarray, "_ 3"]]) -> LocalBatch:
+    """Clouds in their scans' frames (meters) as one batch of objects, padded and encoded (paper §3.1).
+
+    Raises ValueError as `pad_clouds` does.
+    """
+    cloud = pad_clouds(clouds, MAX_POINTS)
+    return batch_of(cloud, encode(prior, cloud))
 
 
 def batch_of(cloud: PointCloud, code: Embedding, sight: Sight | None = None) -> LocalBatch:

@@ -14,11 +14,13 @@ import jax
 from more2_jax.config import DescentRegistration, MotionModel, RegistrationMethod
 from more2_jax.network.prior import Prior, check_embedding
 from more2_jax.registration.descent import register_by_descent
+from more2_jax.registration.older_calls import accepts_clouds
 from more2_jax.registration.pair_batch import PairBatch
 from more2_jax.registration.surface import register_by_surfaces
 from more2_jax.types import Registration
 
 
+@accepts_clouds
 def register(
     prior: Prior, pairs: PairBatch, method: RegistrationMethod, motion: MotionModel = "free"
 ) -> Registration:
