@@ -134,7 +134,7 @@ def compared_objects(
     scan: Scan,
     config: SceneConfig,
 ) -> tuple[list[tuple[ObservedObject, Pose]], list[ObservedObject]]:
-    """The scene's objects (scene's frame, each with the pose to its own) and a scan's instances, as stages take them."""
+    """The objects (scene's frame, each with the pose to its own) and a scan's instances, as stages take them."""
     of_objects = object_sights(scene.objects, scene.scans)
     of_instances = instance_sights(instances, scan, remembered(scan.background))
     old = [known_object(o, view, config) for o, view in zip(scene.objects, of_objects, strict=True)]
