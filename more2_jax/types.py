@@ -12,8 +12,6 @@ import numpy as np
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
-from more2_jax.geometry.poses import Points
-
 T = TypeVar("T")
 
 
@@ -260,7 +258,7 @@ class LivingScene:
 class ObservedObject:
     """An object or an instance as it is compared: points and embedding in one scan's frame."""
 
-    points: Points
+    points: Float[np.ndarray, "_ 3"]  # meters, float64
     embedding: Embedding
     color: Color | None = None
     sight: Sight | None = None
