@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TypeVar, dataclass_transform
+from typing import TYPE_CHECKING, TypeVar, dataclass_transform
 
 import flax.struct
 import jaxlie
@@ -13,6 +13,11 @@ from jax import Array
 from jaxtyping import Bool, Float, Int
 
 T = TypeVar("T")
+
+if not TYPE_CHECKING:  # where a checker must not believe that every name exists
+    from more2_jax.renamed import names_of
+
+    __getattr__ = names_of(__name__)
 
 
 @dataclass_transform(frozen_default=True, kw_only_default=True)

@@ -1,4 +1,4 @@
-"""TODO"""
+"""Rigid poses on the host: 4×4 matrices in float64 applied, compared, and taken to and from local float32 frames."""
 
 from __future__ import annotations
 
@@ -9,12 +9,8 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 Points = Float[np.ndarray, "_ 3"]  # clouds of one call differ in size
-
-
 Matrix3 = Float[np.ndarray, "3 3"]
-
-
-Pose = Float[np.ndarray, "4 4"]
+Pose = Float[np.ndarray, "4 4"]  # `T_a_b`, row-major, float64
 
 
 def rotation_error_deg(R: Matrix3, R_true: Matrix3) -> float:

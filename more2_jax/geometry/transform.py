@@ -1,4 +1,4 @@
-"""TODO"""
+"""Records of an object in another frame or unit: every field moves as its kind does, nothing is encoded again."""
 
 from __future__ import annotations
 

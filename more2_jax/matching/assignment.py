@@ -1,4 +1,4 @@
-"""TODO"""
+"""One assignment over the pairs of two scans by their log odds (paper §3.2), and how sure each of its answers is."""
 
 from __future__ import annotations
 

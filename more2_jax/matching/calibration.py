@@ -1,4 +1,4 @@
-"""TODO"""
+"""From what is known of a pair to log odds of being one object: logistic regression, its weights and its features."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""TODO"""
+"""Registration by descent (paper §3.3): SDF and chamfer loss minimized on SE(3) from the best starts, then ICP."""
 
 from __future__ import annotations
 

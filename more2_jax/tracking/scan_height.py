@@ -1,4 +1,4 @@
-"""TODO"""
+"""The height of a scan's frame in the scene's: proposed by floors, tops and bottoms, decided by how pairs then fit."""
 
 from __future__ import annotations
 
