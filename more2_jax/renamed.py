@@ -17,7 +17,7 @@ from types import ModuleType
 from typing import Any
 
 ROOT = "more2_jax"
-PROGRAMS = "train"  # what only training uses lives there, outside of the library
+PROGRAMS = ("train", "eval")  # what only these use lives there, outside of the library
 ENDS = "the old name goes with the next release"
 # Old module → where its names live now.
 MODULES = {
@@ -242,9 +242,9 @@ def _imported(old: str, home: str) -> ModuleType:
     try:
         return importlib.import_module(home)
     except ModuleNotFoundError as error:
-        if error.name is None or not f"{home}.".startswith(f"{PROGRAMS}.") or not home.startswith(error.name):
+        if home.partition(".")[0] not in PROGRAMS or not home.startswith(error.name or home):
             raise
-        where = "a training program of the repository, which is not installed with the library"
+        where = "the repository's programs, which are not installed with the library"
         raise ImportError(f"{old} is {home} now, part of {where}; run from a checkout", name=old) from error
 
 

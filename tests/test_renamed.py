@@ -152,7 +152,7 @@ def test_what_only_training_uses_says_so_without_the_training_programs(monkeypat
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "train", None)
     with pytest.raises(
-        ImportError, match=r"more2_jax\.losses is train\.shards\.losses now, part of a training"
+        ImportError, match=r"more2_jax\.losses is train\.shards\.losses now, part of the repository"
     ):
         former("losses", monkeypatch)
 
