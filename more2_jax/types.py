@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal, TypeVar, dataclass_transform
+from typing import TYPE_CHECKING, Any, Literal, TypeVar, dataclass_transform
 
 import flax.struct
 import jax
@@ -34,6 +34,11 @@ Quantity = Literal[
     "record",
     "invariant",
 ]
+if not TYPE_CHECKING:  # where a checker must not believe that every name exists
+    from more2_jax.renamed import names_of
+
+    __getattr__ = names_of(__name__)
+
 
 
 def quantity(kind: Quantity, **options: Any) -> Any:

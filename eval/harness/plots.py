@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from eval.peers.extra import library
+from eval.harness.extra import library
 from eval.scores.figures import Record, Row
 from more2_jax.metrics import ecdf
 

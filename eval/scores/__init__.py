@@ -1,1 +1,4 @@
-"""TODO"""
+"""Scores of one assignment, pose, mesh or track, and figures over many: denominators, failures, intervals.
+
+May import `eval.data`, `train.furniture`, `more2_jax`.
+"""

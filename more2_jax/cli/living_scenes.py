@@ -70,7 +70,6 @@ def _build(
 ) -> LivingScene:
     """Adds the scans `scene` lacks, saves after each, reconstructs."""
     from more2_jax.scene import add_scan, reconstruct, start_scene
-    from more2_jax.storage.scene_folder import save_scene
 
     kept = 0 if scene is None else len(scene.scans)
     session.steps = (1 if kept == 0 else 0) + _stages_of_add(config) * (len(scans) - max(kept, 1)) + 2
@@ -80,7 +79,7 @@ def _build(
                 scene = start_scene(prior, scan, config, progress=session.watch)
             else:
                 scene = add_scan(prior, scene, scan, config, progress=session.watch)
-            save_scene(scene, out, config, log=session.unsaved())
+            _store(session, scene, out, config)
             kept += 1
         if scene is None:
             raise ValueError("no scans; needed at least one")
@@ -162,10 +161,18 @@ def add(
 
 
 def _save(session: Session, scene: LivingScene, folder: Path, config: SceneConfig) -> None:
+    from more2_jax.storage.scene_folder import PAGE
+
+    _store(session, scene, folder, config)
+    session.say(f"wrote {folder}; page: {folder / PAGE}")
+
+
+def _store(session: Session, scene: LivingScene, folder: Path, config: SceneConfig) -> None:
+    """Writes the folder and its page together: what is cut short leaves both as they were."""
+    from more2_jax.report import report_html
     from more2_jax.storage.scene_folder import save_scene
 
-    save_scene(scene, folder, config, log=session.unsaved())
-    session.say(f"wrote {folder}; page: {folder / 'report.html'}")
+    save_scene(scene, folder, config, log=session.unsaved(), page=report_html(scene, config))
 
 
 def _same_prior(scene: LivingScene, name: str | None) -> Prior:

@@ -24,11 +24,7 @@ def inspect(path: Path, reading: Reading, masks: Path | None, min_points: int) -
 
 def show(folder: Path, open_page: bool, serve: bool = False, port: int = 0) -> None:
     """Prints where the page lies and, with a display, opens it; or serves it to this machine until ctrl-C."""
-    from more2_jax.storage.scene_folder import stored_at
-
-    page = stored_at(folder) / "report.html"
-    if not (page.parent / "scene.json").is_file() or not page.is_file():
-        raise ValueError(f"{folder}: no living scene with a page; `more2 run` makes one")
+    page = _page_of(folder)
     server = scene_server(page.parent, port) if serve else None
     address = page.as_uri() if server is None else address_of(server)
     Session().say(str(page) if server is None else f"{address} (ctrl-C ends)")
@@ -36,6 +32,21 @@ def show(folder: Path, open_page: bool, serve: bool = False, port: int = 0) -> N
         webbrowser.open(address)
     if server is not None:
         serve_until_interrupted(server)
+
+
+def _page_of(folder: Path) -> Path:
+    """The page of a stored living scene; made where the scene was saved without one, from Python."""
+    from more2_jax.storage.scene_folder import PAGE, load_scene, stored_at
+
+    page = stored_at(folder) / PAGE
+    if not (page.parent / "scene.json").is_file():
+        raise ValueError(f"{folder}: no living scene with a page; `more2 run` makes one")
+    if not page.is_file():
+        from more2_jax.report import write_report
+
+        scene, config = load_scene(folder)
+        write_report(scene, page, config)
+    return page
 
 
 def has_display() -> bool:

@@ -1,4 +1,7 @@
-"""A living scene for other tools: glTF, USD, PLY, JSON."""
+"""A living scene for other tools: glTF, USD, PLY, JSON, a module each; `export_scene` is the door.
+
+May import `report` (its colors), `storage`, `tracking`, `geometry`, `types`.
+"""
 
 from __future__ import annotations
 

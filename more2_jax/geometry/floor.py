@@ -1,4 +1,4 @@
-"""TODO"""
+"""The floor of a room, from the points that belong to no object."""
 
 from __future__ import annotations
 
@@ -7,11 +7,7 @@ import numpy as np
 from more2_jax.geometry.poses import Points
 
 LAYER_M = 0.02  # thickness of the layers among which a floor is sought
-
-
 STRAY = (0.002, 0.998)  # quantiles of height outside of which points are none of a room's
-
-
 FLOOR_SHARE = 0.3  # of the fullest layer: the lowest that holds as much is the floor
 
 

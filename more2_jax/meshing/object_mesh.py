@@ -1,4 +1,4 @@
-"""TODO"""
+"""Meshes of a scene's objects (paper §3.4): what was seen of each, its floor and its box, handed to extraction."""
 
 from __future__ import annotations
 
@@ -24,11 +24,7 @@ from more2_jax.tracking.objects import (
 from more2_jax.types import Mesh, ScanRecord, SceneObject
 
 STRAYS = 0.02  # share of an object's points that may lie below the floor,
-
-
 BELOW_M = 0.05  # by more than this
-
-
 # About 70 MB each: a scene of eight objects took 662 MB one at a time, 1,131 MB all at once.
 MESHES_AT_ONCE = 8
 

@@ -1,4 +1,4 @@
-"""TODO"""
+"""Proof that a converted checkpoint computes what the published layers do, by a file of their inputs and outputs."""
 
 from __future__ import annotations
 
@@ -19,8 +19,6 @@ from more2_jax.network.torch_checkpoint import DAMAGED
 from more2_jax.types import Embedding
 
 WEIGHTS = "w/"  # prefix of weights inside a reference file
-
-
 OUTPUTS = ("F_inv", "F_eqv", "F_s", "F_c", "sdf")
 
 

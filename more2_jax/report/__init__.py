@@ -1,4 +1,7 @@
-"""The page a person looks at: one HTML file that needs nothing else."""
+"""The page a person looks at: one HTML file that needs nothing else; `report_html` makes it, `page` puts it together.
+
+May import `tracking`, `geometry`, `config`, `types`.
+"""
 
 from more2_jax.report.page import report_html, write_report
 from more2_jax.report.palette import color, rgb

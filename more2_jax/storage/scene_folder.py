@@ -22,7 +22,6 @@ import numpy as np
 import yaml
 
 from more2_jax.config import SceneConfig, load_config, to_yaml
-from more2_jax.report import write_report
 from more2_jax.storage.ply_files import read_mesh, read_points, write_mesh, write_points
 from more2_jax.types import (
     Anchors,
@@ -39,12 +38,13 @@ from more2_jax.types import (
 
 VERSION = 1
 STAGES = ("encode", "match", "register", "close", "joint", "mesh")
+PAGE = "report.html"
 WRITTEN = (
     "scene.json",
     "objects",
     "background.ply",
     "embeddings.npz",
-    "report.html",
+    PAGE,
     "run.log",
     "config.yaml",
 )
@@ -103,10 +103,13 @@ def _is_scene(folder: Path) -> bool:
 # --- writing ------------------------------------------------------------------------------------------------
 
 
-def save_scene(scene: LivingScene, folder: str | Path, config: SceneConfig, *, log: str = "") -> None:
+def save_scene(
+    scene: LivingScene, folder: str | Path, config: SceneConfig, *, log: str = "", page: str | None = None
+) -> None:
     """Writes the living-scene folder, whole or not at all; a living scene already there is replaced.
 
-    `log` is appended to the folder's run.log. Other files in the folder are kept.
+    `log` is appended to the folder's run.log. `page` is the scene's HTML (`report.report_html`), stored as
+    report.html; with None the folder has no page, `more2 show` makes one. Other files in the folder are kept.
     Raises ValueError where `check_output` does, when a number of the scene is not finite, or without objects.
     """
     check_output(folder)
@@ -120,7 +123,7 @@ def save_scene(scene: LivingScene, folder: str | Path, config: SceneConfig, *, l
     for left_over in (new, old):
         shutil.rmtree(left_over, ignore_errors=True)
     try:
-        _fill(new, scene, config, _log_of(folder) + log)
+        _fill(new, scene, config, _log_of(folder) + log, page)
         _keep_other_files(folder, new)
     except BaseException:
         shutil.rmtree(new, ignore_errors=True)
@@ -131,7 +134,7 @@ def save_scene(scene: LivingScene, folder: str | Path, config: SceneConfig, *, l
     shutil.rmtree(old, ignore_errors=True)
 
 
-def _fill(folder: Path, scene: LivingScene, config: SceneConfig, log: str) -> None:
+def _fill(folder: Path, scene: LivingScene, config: SceneConfig, log: str, page: str | None) -> None:
     (folder / "objects").mkdir(parents=True)
     text = json.dumps(scene_to_json(scene), indent=1, allow_nan=False)
     (folder / "scene.json").write_text(text + "\n", encoding="utf-8")
@@ -145,7 +148,8 @@ def _fill(folder: Path, scene: LivingScene, config: SceneConfig, log: str) -> No
     np.savez_compressed(folder / "embeddings.npz", **({"id": ids} | stacked))  # type: ignore[arg-type]
     (folder / "config.yaml").write_text(to_yaml(config), encoding="utf-8")
     (folder / "run.log").write_text(log, encoding="utf-8")
-    write_report(scene, folder / "report.html", config)
+    if page is not None:
+        (folder / PAGE).write_text(page, encoding="utf-8")
 
 
 def _write_background(path: Path, scans: Sequence[ScanRecord]) -> None:

@@ -1,1 +1,12 @@
-"""TODO"""
+"""A new scan against the objects known so far: its frame, who is who in it, and what each object gains.
+
+Turns scene records into observed objects for the stages below, and what these answer into records.
+May import `matching`, `registration`, `network`, `geometry`, `config`, `types`.
+"""
+
+from typing import TYPE_CHECKING
+
+if not TYPE_CHECKING:  # where a checker must not believe that every name exists
+    from more2_jax.renamed import names_of
+
+    __getattr__ = names_of(__name__)

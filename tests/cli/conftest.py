@@ -9,6 +9,7 @@ from factories import living_scene
 
 from more2_jax.config import preset
 from more2_jax.network.prior import init_prior, save_prior
+from more2_jax.report import report_html
 from more2_jax.storage.scene_folder import save_scene
 
 
@@ -26,5 +27,6 @@ def own_cache(monkeypatch, tmp_path_factory):
 
 @pytest.fixture
 def stored(tmp_path) -> Path:
-    save_scene(living_scene(), tmp_path / "room", preset("robust", upright=True))
+    scene, config = living_scene(), preset("robust", upright=True)
+    save_scene(scene, tmp_path / "room", config, page=report_html(scene, config))
     return tmp_path / "room"

@@ -54,6 +54,15 @@ def test_show_prints_the_page_and_opens_it_only_with_a_display(stored, capsys, m
     assert len(opened) == 1
 
 
+def test_show_makes_the_page_that_a_save_from_python_left_out(stored, capsys):
+    page = stored / "report.html"
+    before = page.read_text(encoding="utf-8")
+    page.unlink()
+    assert main(["show", str(stored), "--no-open"]) == 0
+    assert Path(capsys.readouterr().out.strip()) == page
+    assert page.read_text(encoding="utf-8") == before
+
+
 def test_show_without_a_scene(tmp_path, capsys):
     assert "no living scene" in refused(capsys, "show", tmp_path)
 

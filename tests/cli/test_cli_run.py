@@ -15,6 +15,7 @@ from rich.table import Table
 from more2_jax.cli import living_scenes as building
 from more2_jax.cli.main import main
 from more2_jax.config import preset
+from more2_jax.report import report_html
 from more2_jax.storage.scene_folder import load_scene, save_scene
 
 
@@ -35,10 +36,12 @@ def test_run_then_add(tmp_path, tiny, capsys):
         "inv",
     )
     assert "meshing the scene: 2 objects" in (out / "run.log").read_text()
+    assert (out / "report.html").read_text(encoding="utf-8") == report_html(scene, config)
     assert main(["add", str(out), str(c), "--prior", str(tiny)]) == 0
     added, again = load_scene(out)
     assert [s.name for s in added.scans] == ["a", "b", "c"]
     assert again == config
+    assert (out / "report.html").read_text(encoding="utf-8") == report_html(added, again)
     assert added.objects[0].id == scene.objects[0].id
     assert sum(len(o.observations) for o in added.objects) == 7
     assert [p.name for p in tmp_path.iterdir() if p.name.startswith(".")] == []
@@ -81,7 +84,7 @@ def test_ctrl_c_while_writing_leaves_the_old_scene(tmp_path, stored, monkeypatch
     def interrupted(*args):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("more2_jax.storage.scene_folder.write_report", interrupted)
+    monkeypatch.setattr("more2_jax.storage.scene_folder.to_yaml", interrupted)
     with pytest.raises(KeyboardInterrupt):
         save_scene(dataclasses.replace(living_scene(), prior="newer"), stored, preset("robust"))
     assert load_scene(stored)[0].prior == "small"

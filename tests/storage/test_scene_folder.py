@@ -73,7 +73,7 @@ def test_the_frame_of_a_scan_is_that_of_its_observations(tmp_path):
 
 
 def test_folder_satisfies_the_schema(tmp_path):
-    save_scene(living_scene(), tmp_path / "scene", CONFIG)
+    save_scene(living_scene(), tmp_path / "scene", CONFIG, page="<p>page</p>")
     schema = json.loads((Path(more2_jax.__file__).parent / "assets/scene.schema.json").read_text())
     jsonschema.Draft202012Validator.check_schema(schema)
     content = json.loads((tmp_path / "scene/scene.json").read_text())
@@ -87,6 +87,22 @@ def test_folder_satisfies_the_schema(tmp_path):
     }
     listed = {o[k] for o in content["objects"] for k in ("mesh", "points")} - {None}
     assert names == listed | {"scene.json", "embeddings.npz", "report.html", "run.log", "config.yaml"}
+
+
+def test_a_page_is_stored_as_given_and_never_outlives_its_scene(tmp_path):
+    page = tmp_path / "scene" / "report.html"
+    save_scene(living_scene(), tmp_path / "scene", CONFIG, page="<p>Räum</p>")
+    assert page.read_text(encoding="utf-8") == "<p>Räum</p>"
+    save_scene(living_scene(), tmp_path / "scene", CONFIG)
+    assert not page.exists()
+
+
+def test_saving_and_loading_know_no_page():
+    code = (
+        "import sys, more2_jax.storage.scene_folder\n"
+        "assert not [m for m in sys.modules if m.startswith('more2_jax.report')]"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
 
 
 @pytest.mark.parametrize("key", ["version", "unit", "scans", "objects", "changes", "timing_s"])

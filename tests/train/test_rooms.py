@@ -10,6 +10,7 @@ import trimesh
 from places import DATA
 
 from train.furniture.collections import read_meshes
+from train.furniture.symmetry import yaw_symmetry
 from train.rooms.ray_scanner import (
     PlacedMesh,
     SensorConfig,
@@ -18,7 +19,6 @@ from train.rooms.ray_scanner import (
     free_spot,
     scan_room,
     upright_pose,
-    yaw_symmetry,
 )
 from train.rooms.visits import FlyingConfig, FlyingScene, TrueObject, arrange, flying_scene
 

@@ -1,1 +1,4 @@
-"""TODO"""
+"""Meshes of furniture: collections as they come, closed solids made of them, symmetries, procedural pieces.
+
+May import `more2_jax.geometry`, `more2_jax.types`.
+"""

@@ -1,1 +1,4 @@
-"""TODO"""
+"""A training run: its state and steps, schedule, devices, checkpoints, validation, and what it writes down.
+
+May import `train.rooms`, `train.shards`, `train.furniture`, `more2_jax`.
+"""

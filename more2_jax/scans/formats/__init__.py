@@ -1,1 +1,4 @@
-"""The formats of scans, a module each; `registry` lists them."""
+"""The formats of scans, a module each; `registry` lists them, the most particular first.
+
+May import `scans.files`, `scans.labeled_cloud`, `scans.segment_groups`, `scans.structural_labels`, `types`.
+"""

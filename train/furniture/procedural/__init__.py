@@ -1,4 +1,7 @@
-"""Parametric furniture."""
+"""Parametric furniture: a recipe a category, built of shared parts, drawn by seed.
+
+May import `train.furniture.source_mesh`.
+"""
 
 from train.furniture.procedural.furniture import (
     CATEGORIES,
