@@ -12,8 +12,9 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
-from more2_jax.config import TrainingRun, load_config
+from more2_jax.config import load_config
 from train.run.program import run
+from train.run.settings import TrainingRun
 from train.shards.loading import sample_records, training_records, training_samples
 from train.shards.shards import open_shards
 

@@ -137,9 +137,9 @@ def extents_recall(room: FlyingScene) -> float:
     for scan in room.scans[:2]:
         extents = []
         for instance in scan.instances:
-            centerd = instance.points - instance.points.mean(axis=0)
+            centered = instance.points - instance.points.mean(axis=0)
             extents.append(
-                np.sort(np.ptp(centerd @ np.linalg.svd(centerd, full_matrices=False)[2].T, axis=0))
+                np.sort(np.ptp(centered @ np.linalg.svd(centered, full_matrices=False)[2].T, axis=0))
             )
         rows.append(np.log(np.array(extents)))
     source, target = linear_sum_assignment(np.linalg.norm(rows[0][:, None] - rows[1][None], axis=-1))

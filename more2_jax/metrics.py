@@ -1,4 +1,4 @@
-"""Metrics of the paper (METHOD 9), in NumPy on the host; meters and degrees."""
+"""Metrics of the paper (paper §4), in NumPy on the host; meters and degrees."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Metrics (METHOD 9) against slow, independent computations; each has a case that gives zero and one that does not."""
+"""Metrics (paper §4) against slow, independent computations; each has a case that gives zero and one that does not."""
 
 import itertools
 import math

@@ -24,7 +24,7 @@ from jax import Array
 from jax.sharding import Mesh
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
-from more2_jax.config import PriorConfig, TrainingConfig, TrainingRun, load_config
+from more2_jax.config import PriorConfig, load_config
 from more2_jax.network.prior import Prior, encode_ordered, init_prior, load_prior, save_prior
 from train.run.checkpoints import keep, open_checkpoints, resume
 from train.run.devices import agreed, connect, device_a_core, device_mesh, everywhere, here, is_first, to_read
@@ -32,6 +32,7 @@ from train.run.journal import Journal
 from train.run.memory import keep_freed_memory
 from train.run.pictures import held_out
 from train.run.program import run
+from train.run.settings import TrainingConfig, TrainingRun
 from train.run.shape_mix import load_mix
 from train.run.state import TrainingState, initial_state, training_step
 from train.run.validation import total_score, validate
@@ -146,7 +147,7 @@ def started_warm(model: PriorConfig, weights: str, name: str) -> Prior:
 
 
 def calibrated(model: PriorConfig, training: TrainingConfig, shapes: Shapes) -> PriorConfig:
-    """Chooses the encoder's output constant so that F_s ≈ 1 at step 0 on the training shapes (METHOD 1)."""
+    """Chooses the encoder's output constant so that F_s ≈ 1 at step 0 on the training shapes (paper §3.1)."""
     unit = dataclasses.replace(model, encoder=dataclasses.replace(model.encoder, output_scale=1.0))
     prior = init_prior(unit, jax.random.key(training.seed))
     index = jnp.asarray(np.linspace(0, len(shapes.views) - 1, min(32, len(shapes.views))).astype(int))

@@ -17,7 +17,7 @@ NORMAL_RADIUS, FEATURE_RADIUS = 2.5 * VOXEL, 5 * VOXEL
 
 @dataclass(frozen=True, kw_only=True)
 class Featured:
-    """A thinned cloud with normals, and a feature a point; centerd, in units of `diagonal`."""
+    """A thinned cloud with normals, and a feature a point; centered, in units of `diagonal`."""
 
     cloud: Any  # open3d.geometry.PointCloud
     feature: Any  # open3d.pipelines.registration.Feature

@@ -24,9 +24,9 @@ PAIRS, BINS, LONGEST_M = 20_000, 64, 4.0  # of D2
 
 def sorted_extents(cloud: Points) -> Float[np.ndarray, "3"]:
     """Logarithm of the sorted extents along the principal axes: metric size alone."""
-    centerd = cloud - cloud.mean(axis=0)
-    axes = np.linalg.svd(centerd[:: max(1, len(centerd) // 2000)], full_matrices=False)[2]
-    return np.log(np.maximum(np.sort(np.ptp(centerd @ axes.T, axis=0)), 1e-3))
+    centered = cloud - cloud.mean(axis=0)
+    axes = np.linalg.svd(centered[:: max(1, len(centered) // 2000)], full_matrices=False)[2]
+    return np.log(np.maximum(np.sort(np.ptp(centered @ axes.T, axis=0)), 1e-3))
 
 
 def d2(cloud: Points) -> Float[np.ndarray, "bins"]:

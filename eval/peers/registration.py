@@ -1,7 +1,7 @@
 """What one would register two clouds of an object with instead: global features, or many starts of GICP.
 
 Each takes source and target (meters, each in its scan's frame) and whether objects only turn about the vertical, and
-returns `T_target_source`, or None where it fails. All work on clouds centerd on their means, in units of the
+returns `T_target_source`, or None where it fails. All work on clouds centered on their means, in units of the
 target's diagonal: features and thresholds then fit a stool and a wardrobe.
 """
 
@@ -99,7 +99,7 @@ def starts(upright: bool, free: int = 60) -> list[Pose]:
 
 
 def refined(source: Points, target: Points, poses: Sequence[Pose]) -> Pose | None:
-    """GICP from poses between the centerd, scaled clouds; the one that fits best, back in meters."""
+    """GICP from poses between the centered, scaled clouds; the one that fits best, back in meters."""
     found = best_fit(source, target, poses)
     return None if found is None else found[0]
 

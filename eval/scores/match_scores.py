@@ -1,4 +1,4 @@
-"""Scores of one assignment between two scans (METHOD 9), in three columns.
+"""Scores of one assignment between two scans (paper §4), in three columns.
 
 `paper`: a match is right if it names the very object. `published`: a copy is as good, however often it is named.
 `strict`: a copy is as good, but only once; matches of objects that have no partner count against F1.

@@ -1,4 +1,4 @@
-"""Scores of one mesh against the true one (METHOD 9), in three columns.
+"""Scores of one mesh against the true one (paper §4), in three columns.
 
 `paper`: the printed formulas, canonical units (longest edge 0.9). `published`: as the published code computes them:
 its Chamfer-L1 is squared and against vertices, its IoU the share of true vertices inside. `strict`: meters, true

@@ -1,4 +1,4 @@
-"""Scores of one pose (METHOD 9), in three columns.
+"""Scores of one pose (paper §4), in three columns.
 
 `paper`: the printed formula. `published`: as the published code computes it. `strict`: over the object's own
 symmetry group, in meters. A failure has None for every score.

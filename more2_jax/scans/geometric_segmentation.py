@@ -111,16 +111,16 @@ def _normals(voxels: Float[np.ndarray, "v 3"], neighbors: int) -> Float[np.ndarr
     """Direction of least spread among the nearest voxels; its sign means nothing."""
     k = min(neighbors, len(voxels))
     near = KDTree(voxels).query(voxels, k=k)[1].reshape(len(voxels), k)
-    centerd = voxels[near] - voxels[near].mean(axis=1, keepdims=True)
-    return np.linalg.eigh(np.einsum("vki,vkj->vij", centerd, centerd))[1][:, :, 0]
+    centered = voxels[near] - voxels[near].mean(axis=1, keepdims=True)
+    return np.linalg.eigh(np.einsum("vki,vkj->vij", centered, centered))[1][:, :, 0]
 
 
 def _extent(points: Float[np.ndarray, "n 3"]) -> float:
     """Length along the direction of greatest spread, in any frame the same."""
     if not len(points):
         return 0.0
-    centerd = points - points.mean(axis=0)
-    return float(np.ptp(centerd @ np.linalg.eigh(centerd.T @ centerd)[1][:, -1]))
+    centered = points - points.mean(axis=0)
+    return float(np.ptp(centered @ np.linalg.eigh(centered.T @ centered)[1][:, -1]))
 
 
 # --- planes -------------------------------------------------------------------------------------------------

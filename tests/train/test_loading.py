@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from places import ROOT
 
-from more2_jax.config import TrainingConfig
+from train.run.settings import TrainingConfig
 from train.shards.loading import step_key, training_records, training_samples
 from train.shards.sampling import sample_batch
 from train.shards.shards import Shapes, open_shards

@@ -24,7 +24,7 @@ def labeled(vertices: np.ndarray, faces: np.ndarray, seed: int = 0) -> tuple[np.
 # --- the canonical frame ------------------------------------------------------------------------------------
 
 
-def test_canonical_is_centerd_and_of_known_size():
+def test_canonical_is_centered_and_of_known_size():
     vertices, scale = canonical(np.array([[1.0, 2, 3], [5, 4, 3], [2, 3, 3.5]]))
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     np.testing.assert_allclose(low + high, 0, atol=1e-12)

@@ -34,7 +34,8 @@ import dataclasses, json, sys
 from pathlib import Path
 import jax, numpy as np
 from jax.sharding import Mesh
-from more2_jax.config import TrainingRun, load_config
+from more2_jax.config import load_config
+from train.run.settings import TrainingRun
 from more2_jax.network.prior import init_prior
 from train.run.devices import ROWS, everywhere
 from train.run.shape_mix import load_mix

@@ -35,7 +35,7 @@ class Solid:
 
 
 def canonical(vertices: Float[np.ndarray, "v 3"]) -> tuple[Float[np.ndarray, "v 3"], float]:
-    """Bounding box centerd at the origin, longest edge 0.9; and source units per canonical unit.
+    """Bounding box centered at the origin, longest edge 0.9; and source units per canonical unit.
 
     Raises ValueError if there are no vertices, or their extent is zero or not finite.
     """

@@ -12,11 +12,12 @@ import optax
 from jax import Array
 from jax.sharding import Mesh
 
-from more2_jax.config import PriorConfig, TrainingConfig
+from more2_jax.config import PriorConfig
 from more2_jax.network.prior import Prior
 from more2_jax.types import pytree
 from train.run.devices import by_rows
 from train.run.schedule import learning_rate
+from train.run.settings import TrainingConfig
 from train.shards.losses import total_loss
 from train.shards.sampling import TrainingSample, sample_batch
 from train.shards.shards import Shapes

@@ -8,9 +8,9 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from more2_jax.config import TrainingConfig
 from more2_jax.geometry.points import kabsch_rotation
 from more2_jax.network.prior import Prior
+from train.run.settings import TrainingConfig
 from train.shards.losses import predict
 from train.shards.sampling import TrainingSample, sample_batch
 from train.shards.shards import Shapes

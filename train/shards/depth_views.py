@@ -1,4 +1,4 @@
-"""Depth maps of a shape from all around, back-projected: what partial clouds are drawn from (METHOD 2)."""
+"""Depth maps of a shape from all around, back-projected: what partial clouds are drawn from (paper §3.1)."""
 
 from __future__ import annotations
 

@@ -16,8 +16,8 @@ import jax
 import numpy as np
 from jax import Array
 
-from more2_jax.config import TrainingConfig
 from train.shards.sampling import TrainingSample, row_keys, sample_rows
+from train.shards.settings import SampleConfig
 from train.shards.shards import Shapes, ShardView, open_shards
 
 if TYPE_CHECKING:
@@ -60,7 +60,7 @@ class BatchReader:
 
 def training_records(
     view: ShardView,
-    config: TrainingConfig,
+    config: SampleConfig,
     seed: int,
     batch: int,
     process_index: int = 0,
@@ -93,7 +93,7 @@ def step_key(seed: int, step: int) -> Array:
     return jax.random.fold_in(jax.random.key(seed), step)
 
 
-def sample_records(records: dict[str, Any], seed: int, config: TrainingConfig, points: int) -> TrainingSample:
+def sample_records(records: dict[str, Any], seed: int, config: SampleConfig, points: int) -> TrainingSample:
     """The samples of what `training_records` read, computed where its arrays are (NumPy: the default device)."""
     arrays = {name: records[name] for name in ("views", "sdf_uniform", "sdf_near")}
     return _sample(arrays, records["rows"], seed, records["step"], config, points)
@@ -101,7 +101,7 @@ def sample_records(records: dict[str, Any], seed: int, config: TrainingConfig, p
 
 @jax.jit(static_argnames=("config", "points"))
 def _sample(
-    arrays: dict[str, Array], rows: Array, seed: Array, step: Array, config: TrainingConfig, points: int
+    arrays: dict[str, Array], rows: Array, seed: Array, step: Array, config: SampleConfig, points: int
 ) -> TrainingSample:
     keys = row_keys(jax.random.fold_in(jax.random.key(seed), step), rows)
     index = np.arange(1, len(rows) + 1)
@@ -111,7 +111,7 @@ def _sample(
 def training_samples(
     folders: str | Path | Sequence[str | Path],
     split: str,
-    config: TrainingConfig,
+    config: SampleConfig,
     points: int,
     seed: int,
     batch: int,

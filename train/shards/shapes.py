@@ -1,4 +1,4 @@
-"""From a source mesh to what training needs of it: solid, depth views, signed distances (METHOD 2)."""
+"""From a source mesh to what training needs of it: solid, depth views, signed distances (paper §3.1)."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ FINGERPRINT_SIDE = 8  # of the grid of distances by which near-duplicates are fo
 
 @dataclass(frozen=True, kw_only=True)
 class Shape:
-    """A training shape: closed, centerd, longest edge 0.9 (canonical units)."""
+    """A training shape: closed, centered, longest edge 0.9 (canonical units)."""
 
     vertices: Float[np.ndarray, "v 3"]
     faces: Int[np.ndarray, "f 3"]

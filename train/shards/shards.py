@@ -11,7 +11,7 @@ import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -21,7 +21,9 @@ from jaxtyping import Float
 from more2_jax.types import pytree
 from train.furniture.packed import read_packed, write_packed
 from train.furniture.source_mesh import SourceMesh
-from train.shards.shapes import Shape
+
+if TYPE_CHECKING:  # making shapes needs the extra `data`, training on them does not
+    from train.shards.shapes import Shape
 
 MAPPED = ("views", "sdf_uniform", "sdf_near")  # what samples are drawn from
 ARRAYS = (*MAPPED, "fingerprint")
@@ -30,7 +32,7 @@ EXCLUDED = "excluded.json"
 
 @pytree
 class Shapes:
-    """Training shapes in canonical units (centerd, longest edge 0.9), float16."""
+    """Training shapes in canonical units (centered, longest edge 0.9), float16."""
 
     views: Float[Array, "shapes views n 3"]  # back-projected depth maps
     sdf_uniform: Float[Array, "shapes q 4"]  # x y z and signed distance, negative inside

@@ -1,6 +1,6 @@
 """What furniture stands on: four legs of many styles, sleds, trestles, panels, pedestals, stars on castors.
 
-Each is centerd under a plan of x × y, stands on z = 0 and reaches `BITE` above `height`.
+Each is centered under a plan of x × y, stands on z = 0 and reaches `BITE` above `height`.
 """
 
 from __future__ import annotations
