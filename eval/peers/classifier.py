@@ -30,7 +30,7 @@ from train.prior import started_cold
 from train.run.program import run
 from train.run.schedule import learning_rate
 from train.run.settings import TrainingConfig, TrainingRun
-from train.run.shape_mix import load_mix
+from train.run.shape_mix import load_mix, open_mix
 from train.shards.sampling import TrainingSample
 from train.shards.shards import open_shards
 
@@ -50,7 +50,7 @@ def main(config: Path, shards: tuple[Path, ...], out: Path, steps: int = 600) ->
     training = dataclasses.replace(settings.training, steps=steps)
     shapes, rows = load_mix(shards, "train")
     names, labels = categories(list(dict.fromkeys(shards)))
-    prior = started_cold(settings, shapes, "classifier")
+    prior = started_cold(settings, open_mix(shards, "train"), "classifier")
     head = jnp.zeros((prior.config.encoder.code, len(names)))
     params: dict[str, Any] = {"encoder": prior.params["encoder"], "head": head}
     state: Any = optimizer(training).init(params)

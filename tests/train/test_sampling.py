@@ -25,9 +25,9 @@ from train.shards.augmentation import (
     plane_patch,
     start_far_out,
 )
-from train.shards.depth_views import DISTANCE, HALF_FIELD, view_directions
 from train.shards.sampling import partial_cloud, sample_batch
 from train.shards.shards import Shapes
+from train.shards.view_directions import DISTANCE, HALF_FIELD, view_directions
 
 KEYS = jax.random.split(jax.random.key(0), 200)
 CLOUD = jax.random.uniform(jax.random.key(1), (500, 3), minval=-0.45, maxval=0.45)

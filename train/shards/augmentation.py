@@ -12,8 +12,8 @@ import numpy as np
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
-from train.shards.depth_views import DISTANCE, HALF_FIELD, view_directions
 from train.shards.settings import SampleConfig
+from train.shards.view_directions import DISTANCE, HALF_FIELD, view_directions
 
 Cloud = Float[Array, "n 3"]
 Kept = Bool[Array, " n"]

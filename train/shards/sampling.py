@@ -46,35 +46,16 @@ class TrainingSample:
 def sample_batch(
     key: Array, shapes: Shapes, index: Int[Array, " b"], config: SampleConfig, points: int
 ) -> TrainingSample:
-    """Samples shapes `index`; sample i depends on (key, i, index[i], index[i − 1]) alone.
+    """Samples shapes `index`; sample i depends on (key, i) and on the shapes index[i] and index[i − 1] alone.
 
     `points` is the encoder's input size. Fragments that lie beside shape i are of shape i − 1 of the batch.
     """
-    return sample_rows(
-        row_keys(key, jnp.arange(len(index))), shapes, index, jnp.roll(index, 1), config, points
-    )
 
-
-def row_keys(key: Array, rows: Int[Array, " b"]) -> Array:
-    """The keys of rows of a batch."""
-    return jax.vmap(lambda row: jax.random.fold_in(key, row))(rows)
-
-
-def sample_rows(
-    keys: Array,
-    shapes: Shapes,
-    index: Int[Array, " b"],
-    other: Int[Array, " b"],
-    config: SampleConfig,
-    points: int,
-) -> TrainingSample:
-    """One sample a key: of shape `index`, beside fragments of shape `other`."""
-
-    def one(key: Array, i: Array, j: Array) -> TrainingSample:
-        pair = jax.random.split(key)
+    def one(row: Array, i: Array, j: Array) -> TrainingSample:
+        pair = jax.random.split(jax.random.fold_in(key, row))
         return jax.vmap(lambda k: _half_sample(k, shapes, i, shapes.views[j], config, points))(pair)
 
-    return jax.vmap(one)(keys, index, other)
+    return jax.vmap(one)(jnp.arange(len(index)), index, jnp.roll(index, 1))
 
 
 def _half_sample(

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jaxtyping import Float
@@ -113,20 +112,6 @@ def open_shards(folders: str | Path | Sequence[str | Path], split: str) -> Shard
             f"{', '.join(map(str, given))}: no {split} shapes; `python -m train.prepare` makes them"
         )
     return ShardView(shards=tuple(shards), rows=tuple(rows), meta=tuple(meta))
-
-
-def load_shapes(
-    folders: str | Path | Sequence[str | Path], split: str, queries: int = 16_000, most: int | None = None
-) -> Shapes:
-    """The shapes of a split in memory, with the first `queries` of each kind (their order is random already).
-
-    `most` keeps the first so many shapes. ValueError if there is none.
-    """
-    view = open_shards(folders, split)
-    kept = range(len(view) if most is None else min(most, len(view)))
-    cut = {"views": None, "sdf_uniform": queries, "sdf_near": queries}
-    rows = {name: np.stack([view[i][name][:count] for i in kept]) for name, count in cut.items()}
-    return Shapes(**{name: jnp.asarray(array) for name, array in rows.items()})
 
 
 def read_solids(shard: Path) -> list[SourceMesh]:
