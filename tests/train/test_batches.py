@@ -108,5 +108,6 @@ def test_without_grain_one_line_names_the_extra(mix, monkeypatch):
 
 
 def test_training_can_be_imported_without_what_only_making_shards_needs():
-    code = "import sys; import train.prior; assert not {'grain', 'point_cloud_utils', 'embreex', 'trimesh'} & set(sys.modules)"
+    unwanted = {"grain", "point_cloud_utils", "embreex", "trimesh"}
+    code = f"import sys; import train.prior; assert not {unwanted} & set(sys.modules)"
     subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True)
