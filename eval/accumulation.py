@@ -1,4 +1,4 @@
-"""What every further scan adds: coverage, rotation error and Chamfer distance after 1, 2, … scans (METHOD 9).
+"""What every further scan adds: coverage, rotation error and Chamfer distance after 1, 2, … scans (paper §4).
 
 `python -m eval.accumulation --data data/flying_sparse --out runs/accumulation --scenes 10`
 

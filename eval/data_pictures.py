@@ -15,9 +15,9 @@ from trimesh.ray.ray_pyembree import RayMeshIntersector
 
 from train.furniture.source_mesh import SourceMesh
 from train.run.program import run
-from train.shards.depth_views import view_directions
 from train.shards.shards import open_shards, read_meta, read_solids, shard_folders
 from train.shards.signed_distance import BOX, is_inside
+from train.shards.view_directions import view_directions
 
 EYE = np.array([1.1, -1.5, 0.8])
 PIXELS = 110

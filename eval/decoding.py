@@ -27,10 +27,11 @@ from eval.harness.tables import latex, markdown, on_screen
 from eval.peers.learned_decoders import VARIANTS, decoder_of, decoder_step, drawn, optimizer, start
 from eval.prior_scores import BATCH, SEEN, see_twice
 from eval.scores.figures import Figure, Record, rows_of
-from more2_jax.config import TrainingConfig, TrainingRun, load_config
+from more2_jax.config import load_config
 from more2_jax.geometry.points import farthest_points
 from more2_jax.network.prior import Prior, encode_ordered, field_sdf, load_prior, object_field
 from train.run.program import run
+from train.run.settings import TrainingConfig, TrainingRun
 from train.run.shape_mix import load_mix
 from train.shards.shards import open_shards
 

@@ -1,4 +1,4 @@
-"""The whole task: matched, registered and reconstructed objects over all scans (MR and MRR, METHOD 9).
+"""The whole task: matched, registered and reconstructed objects over all scans (MR and MRR, paper §4).
 
 `python -m eval.end_to_end --data data/flying_sparse --out runs/end_to_end --scenes 10`
 

@@ -1,4 +1,4 @@
-"""Who is who between scans: instance and scene recall (METHOD 3 and 9).
+"""Who is who between scans: instance and scene recall (paper §3.2 and §4).
 
 `python -m eval.matching --data data/flying_sparse --out runs/matching --scenes 10`
 

@@ -25,10 +25,11 @@ from rich.progress import track
 from rich.table import Table
 from scipy.spatial.transform import Rotation
 
+from eval.scores.figures import mean_ci95
 from more2_jax.config import CodeMatcher
 from more2_jax.geometry.points import farthest_points, kabsch_rotation
 from more2_jax.matching.code_assignment import hungarian, score_matrix
-from more2_jax.metrics import bootstrap_ci95, symmetry_aware_rotation_error_deg
+from more2_jax.metrics import symmetry_aware_rotation_error_deg
 from more2_jax.network.prior import Prior, encode_ordered, field_sdf, load_prior, object_field
 from more2_jax.types import Embedding
 from train.furniture.symmetry import yaw_symmetry
@@ -220,7 +221,7 @@ def summary(rows: Sequence[Row]) -> dict[str, Any]:
 
 def figure(values: Float[np.ndarray, " n"], value: float) -> dict[str, Any]:
     """One figure with its 95 % interval."""
-    return {"value": float(value), "ci95": list(bootstrap_ci95(values)), "count": len(values)}
+    return {"value": float(value), "ci95": list(mean_ci95(values)), "count": len(values)}
 
 
 def table(results: dict[str, Any]) -> Table:

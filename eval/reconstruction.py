@@ -1,4 +1,4 @@
-"""How well objects are reconstructed: Chamfer, IoU, SDF recall, and what a user of meshes asks (METHOD 5, 6 and 9).
+"""How well objects are reconstructed: Chamfer, IoU, SDF recall, and what a user of meshes asks (paper §3.4 to §4).
 
 `python -m eval.reconstruction --data data/flying_sparse --out runs/reconstruction --scenes 10 --scans 1`
 

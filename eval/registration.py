@@ -1,4 +1,4 @@
-"""Where matched objects went: rotation errors, recalls and distances over true pairs (METHOD 4 and 9).
+"""Where matched objects went: rotation errors, recalls and distances over true pairs (paper §3.3 and §4).
 
 `python -m eval.registration --data data/flying_sparse --out runs/registration --scenes 10`
 """
@@ -81,7 +81,7 @@ def sight_in(scan: Scan, cloud: np.ndarray) -> Sight | None:
 
 
 def figures(right_deg: float) -> list[Figure]:
-    """The figures of METHOD 9; a success is a rotation error below `right_deg`."""
+    """The figures of paper §4; a success is a rotation error below `right_deg`."""
     share = Figure(
         name=f"RR, RE < {right_deg:g}°", key="re_deg", statistic="share", limit=right_deg, unit="%"
     )

@@ -1,6 +1,6 @@
 """All tables of some runs on one page.
 
-`python -m eval.report --runs runs/all/* --out docs/results_tables.md`
+`python -m eval.report --runs runs/all/* --out runs/results_tables.md`
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ MAIN_FIGURE = {  # of each program, the one shown by category
 }
 HEAD = """# Result tables
 
-Written by `python -m eval.report`; [how to make and read them](evaluation.md). Intervals are 95 %, by bootstrap over
+Written by `python -m eval.report`; `docs/evaluation.md` says how to make and read them. Intervals are 95 %, by bootstrap over
 scenes; "of" is the denominator; a failure counts in it. Bold is best of its line, whoever made it.
 
 - *paper's formula*: as printed. *as published*: as the published code computes it. *strict*: rotations over the
@@ -65,7 +65,7 @@ class Result:
         return f"{facts['dataset']}, {facts.get('regime', '')}{turning}"
 
 
-def main(runs: tuple[Path, ...], out: Path = Path("docs/results_tables.md"), note: str = "") -> None:
+def main(runs: tuple[Path, ...], out: Path = Path("runs/results_tables.md"), note: str = "") -> None:
     """Writes one page with the tables of all runs, by data set and regime.
 
     Args:

@@ -26,7 +26,7 @@ from jax import Array
 
 from eval.performance import plain_layers
 from eval.performance.stopwatch import Job, Seconds, interleaved, timed
-from more2_jax.config import PriorConfig, TrainingRun, load_config
+from more2_jax.config import PriorConfig, load_config
 from more2_jax.geometry.points import farthest_points
 from more2_jax.network.decoder import Decoder
 from more2_jax.network.prior import Prior, encode_ordered, init_prior
@@ -34,6 +34,7 @@ from more2_jax.network.row_map import in_turn
 from train.run.devices import by_rows, cores, device_a_core, device_mesh, everywhere
 from train.run.memory import GLIBC_KEEPS_MEMORY, keep_freed_memory
 from train.run.program import run
+from train.run.settings import TrainingRun
 from train.shards.losses import AT_ONCE
 
 WHAT = {"forward": "encoder forward", "encoder_step": "encoder and its gradient", "step": "training step"}

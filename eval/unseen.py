@@ -15,8 +15,10 @@ from rich.progress import track
 from rich.table import Table
 from scipy.optimize import linear_sum_assignment
 
+from eval.scores.figures import mean_ci95
+from eval.scores.tracks import f1
 from more2_jax.config import SceneConfig, preset
-from more2_jax.metrics import bootstrap_ci95, f1, symmetry_aware_rotation_error_deg
+from more2_jax.metrics import symmetry_aware_rotation_error_deg
 from more2_jax.network.prior import Prior, load_prior
 from more2_jax.scene import add_scan, start_scene
 from more2_jax.types import LivingScene
@@ -152,7 +154,7 @@ def extents_recall(room: FlyingScene) -> float:
 def summary(rows: list[float | None]) -> dict[str, Any]:
     """Mean, interval and count over the rooms in which the figure is defined."""
     values = [value for value in rows if value is not None]
-    return {"mean": float(np.mean(values)), "ci95": bootstrap_ci95(values), "count": len(values)}
+    return {"mean": float(np.mean(values)), "ci95": mean_ci95(values), "count": len(values)}
 
 
 if __name__ == "__main__":

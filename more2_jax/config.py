@@ -226,55 +226,6 @@ class SceneConfig:
         return "upright" if self.upright else "free"
 
 
-@dataclass(frozen=True)
-class TrainingConfig:
-    """Training of the prior (METHOD 2); lengths in canonical units (longest edge 0.9)."""
-
-    steps: int = 200_000
-    batch: int = 64  # shapes; two partial clouds each
-    learning_rate: float = 1e-4
-    warmup_steps: int = 200
-    # or ×0.3 at 60, 75 and 90 % of the steps, as published; or constant, and falling in the last fifth
-    schedule: Literal["cosine", "steps", "trapezoid"] = "cosine"
-    clip: float = 1.0
-    ema: float = 0.999
-    queries: int = 1024  # a cloud: half uniform, half near the surface
-    raw_points: int = 2048  # before farthest-point sampling
-    max_views: int = 8
-    noise: float = 0.005
-    augment_probability: float = 0.6  # of a cloud to be open to the flaws below (as published)
-    one_view_probability: float = 0.2  # seen from one side; what follows are shares of the augmented clouds
-    crop_probability: float = 0.5  # a half-space cut off, as by a truncated mask
-    ball_probability: float = 0.5  # a ball removed, as by occlusion
-    junk_probability: float = 0.5  # a fragment of another object, or a patch of floor or wall, added
-    depth_noise_probability: float = 0.4  # the camera's: along the ray, quantized, with lost edges
-    depth_noise: float = 0.002  # standard deviation of inverse depth, 1 / canonical unit
-    depth_step: float = 0.002  # of inverse depth
-    center_jitter: float = 0.0  # standard deviation of a shift of cloud, queries and center; published 0.05
-    stretch: float = 0.0  # axes are scaled by up to this share, at random
-    near_surface: float = 0.1  # |SDF| below it weighs 1, else 0.5
-    center_weight: float = 0.2
-    scale_weight: float = 0.01
-    contrast_weight: float = 0.05  # InfoNCE on F_inv between two partial clouds of one shape
-    contrast_temperature: float = 0.07
-    turn_weight: float = 0.5  # ‖F_eqv − F_eqv'‖² between them: same orientation in, same vectors out
-    rotation_weight: float = 0.0  # how far Kabsch's algorithm is from the identity between them
-    sign_weight: float = 0.0  # cross-entropy of inside and outside
-    sign_width: float = 0.01  # canonical units: where its sigmoid has half of its height
-    up_weight: float = 0.0  # the first third of F_eqv should point up
-    validate_every: int = 250
-    picture_every: int = 1000  # steps; drawn at the next validation
-    seed: int = 0
-
-
-@dataclass(frozen=True)
-class TrainingRun:
-    """One configuration file of train/prior.py."""
-
-    model: PriorConfig = field(default_factory=PriorConfig)
-    training: TrainingConfig = field(default_factory=TrainingConfig)
-
-
 ROBUST_MESHING = MeshingConfig(
     coarse=16,
     resolution=128,

@@ -27,8 +27,9 @@ from page_browser import browser, common, opened, opener, report, said  # noqa: 
 @pytest.fixture(scope="session")
 def tiny_prior():
     """Random weights in the smallest configuration."""
-    from more2_jax.config import TrainingRun, load_config
+    from more2_jax.config import load_config
     from more2_jax.network.prior import init_prior
+    from train.run.settings import TrainingRun
 
     config = load_config(ROOT / "configs" / "tiny.yaml", TrainingRun).model
     return init_prior(config, jax.random.key(0), "tiny")

@@ -5,16 +5,8 @@ import dataclasses
 import pytest
 from places import ROOT
 
-from more2_jax.config import (
-    MatchingConfig,
-    PriorConfig,
-    SceneConfig,
-    TrainingRun,
-    from_dict,
-    load_config,
-    preset,
-    to_yaml,
-)
+from more2_jax.config import MatchingConfig, PriorConfig, SceneConfig, from_dict, load_config, preset, to_yaml
+from train.run.settings import TrainingRun
 
 
 @pytest.mark.parametrize("path", sorted((ROOT / "configs").glob("*.yaml")), ids=lambda p: p.stem)

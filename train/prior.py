@@ -24,21 +24,24 @@ from jax import Array
 from jax.sharding import Mesh
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
-from more2_jax.config import PriorConfig, TrainingConfig, TrainingRun, load_config
+from more2_jax.config import PriorConfig, load_config
 from more2_jax.network.prior import Prior, encode_ordered, init_prior, load_prior, save_prior
+from train.run.batches import Batches, batches_of
 from train.run.checkpoints import keep, open_checkpoints, resume
-from train.run.devices import agreed, connect, device_a_core, device_mesh, everywhere, here, is_first, to_read
+from train.run.devices import agreed, connect, device_a_core, device_mesh, everywhere, here, is_first
 from train.run.journal import Journal
-from train.run.memory import keep_freed_memory
+from train.run.memory import keep_freed_memory, memory_bytes
 from train.run.pictures import held_out
 from train.run.program import run
-from train.run.shape_mix import load_mix
+from train.run.settings import TrainingConfig, TrainingRun
+from train.run.shape_mix import ShapeMix, open_mix
 from train.run.state import TrainingState, initial_state, training_step
-from train.run.validation import total_score, validate
+from train.run.validation import MOST_VALIDATED, total_score, validate
 from train.shards.sampling import sample_batch
 from train.shards.shards import Shapes
 
 IN_PICTURE = 6  # held-out shapes
+CALIBRATED = 32  # training shapes
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,8 +51,7 @@ class Setting:
     training: TrainingConfig
     prior: Prior  # its settings and name; the weights at step 0
     mesh: Mesh
-    train: Shapes  # on every device
-    rows: Array  # to draw from
+    batches: Batches
     val: Shapes
     out: Path
     deadline: float  # of time.monotonic()
@@ -62,6 +64,7 @@ def main(
     minutes: float = math.inf,
     name: str = "",
     warm_start: str = "",
+    resident_share: float = 0.4,
     coordinator: str = "",
     processes: int = 1,
     process: int = 0,
@@ -77,6 +80,8 @@ def main(
         name: of the weights; by default the configuration file's.
         warm_start: weights to begin with in a fresh `--out`: name of shipped ones, or a file; the optimizer starts
             anew. The configuration's `model` has to be theirs.
+        resident_share: of the memory (the device's, on accelerators) that shapes may take; larger collections are read
+            from disk a batch at a time. The numbers are the same.
         coordinator: host:port of process 0, on a run of several processes.
         processes: how many there are.
         process: which of them this is.
@@ -87,7 +92,8 @@ def main(
     device_a_core(settings.training.batch, coordinator)
     connect(coordinator, processes, process)
     first = started_warm(settings.model, warm_start, name) if warm_start else None
-    setting = prepared(settings, shards, out, deadline, name, first)
+    most_bytes = resident_share * memory_bytes()
+    setting = prepared(settings, shards, out, deadline, name, first, most_bytes)
     out.mkdir(parents=True, exist_ok=True)
     with open_checkpoints(out / "checkpoints") as manager:
         state = everywhere(setting.mesh, initial_state(setting.prior, setting.training))
@@ -103,26 +109,25 @@ def prepared(
     out: Path,
     deadline: float,
     name: str,
-    warm: Prior | None = None,
+    warm: Prior | None,
+    most_bytes: float,
 ) -> Setting:
-    """Loads the shapes, initializes the weights if none are given, spreads both over the devices."""
+    """Opens the shapes, of which `most_bytes` may be in memory, and initializes the weights if none are given."""
     training = settings.training
     mesh = device_mesh(training.batch)
-    train, rows = load_mix(shards, "train")
-    val, _ = load_mix(shards, "val")
+    train, val = open_mix(shards, "train"), open_mix(shards, "val")
     return Setting(
         training=training,
         prior=warm or started_cold(settings, train, name),
         mesh=mesh,
-        train=to_read(mesh, train),
-        rows=everywhere(mesh, jnp.asarray(rows)),
-        val=val,
+        batches=batches_of(train, training, mesh, most_bytes),
+        val=jax.tree.map(jnp.asarray, val.read(range(min(MOST_VALIDATED, len(val))))),
         out=out,
         deadline=deadline,
     )
 
 
-def started_cold(settings: TrainingRun, train: Shapes, name: str) -> Prior:
+def started_cold(settings: TrainingRun, train: ShapeMix, name: str) -> Prior:
     """Random weights, F_s being about 1."""
     model = calibrated(settings.model, settings.training, train)
     return init_prior(model, jax.random.key(settings.training.seed), name)
@@ -145,11 +150,13 @@ def started_warm(model: PriorConfig, weights: str, name: str) -> Prior:
     return dataclasses.replace(prior, name=name)
 
 
-def calibrated(model: PriorConfig, training: TrainingConfig, shapes: Shapes) -> PriorConfig:
-    """Chooses the encoder's output constant so that F_s ≈ 1 at step 0 on the training shapes (METHOD 1)."""
+def calibrated(model: PriorConfig, training: TrainingConfig, train: ShapeMix) -> PriorConfig:
+    """Chooses the encoder's output constant so that F_s ≈ 1 at step 0 on the training shapes (paper §3.1)."""
     unit = dataclasses.replace(model, encoder=dataclasses.replace(model.encoder, output_scale=1.0))
     prior = init_prior(unit, jax.random.key(training.seed))
-    index = jnp.asarray(np.linspace(0, len(shapes.views) - 1, min(32, len(shapes.views))).astype(int))
+    shapes = train.read(np.linspace(0, len(train) - 1, min(CALIBRATED, len(train))).astype(int))
+    index = jnp.arange(len(shapes.views))
+    shapes = jax.tree.map(jnp.asarray, shapes)
     sample = sample_batch(jax.random.key(training.seed), shapes, index, training, model.encoder.points)
     scale = jax.jit(jax.vmap(partial(encode_ordered, prior)))(sample.points[:, 0], sample.mask[:, 0]).scale
     constant = float(f"{1 / float(scale.mean()):.3g}")
@@ -170,12 +177,11 @@ def train_until(
     book = Journal(setting.out, step) if is_first() else nullcontext()
     with Progress(*columns, disable=not is_first()) as progress, book as journal:
         task = progress.add_task("training", total=config.steps, completed=step)
-        terms: list[dict[str, Array]] = []
+        batches, terms = setting.batches(step), list[dict[str, Array]]()
         while step < config.steps and not agreed(time.monotonic() > setting.deadline):
             state, last = training_step(
                 state,
-                setting.train,
-                setting.rows,
+                *next(batches),
                 model=setting.prior.config,
                 config=config,
                 mesh=setting.mesh,

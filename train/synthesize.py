@@ -1,4 +1,4 @@
-"""Meshes to scenes of the open FlyingShape benchmark (METHOD 7).
+"""Meshes to scenes of the open FlyingShape benchmark (paper §4).
 
 `python -m train.synthesize --source MESHES --regime paper --scenes 100 --seed 0 --out data/flying_paper`
 

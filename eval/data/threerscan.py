@@ -1,4 +1,4 @@
-"""3RScan as a benchmark (METHOD 8): places of a split, the true associations, ambiguity chains, predicted masks.
+"""3RScan as a benchmark (paper §4): places of a split, the true associations, ambiguity chains, predicted masks.
 
 `<data>/3RScan.json`, or beside the folder of scans; `<data>/<scan>/…` as published. An object's model frame is the
 frame of the reference scan; that of objects which look alike, the pose of the one with the smallest id.

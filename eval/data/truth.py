@@ -84,4 +84,4 @@ class Benchmark:
     read: Callable[[str], KnownScene]
     facts: dict[str, Any]  # data set, regime, version: what a result belongs to
     upright: bool  # objects only turn about the vertical
-    right_deg: float  # a rotation error below it is a success (METHOD 9)
+    right_deg: float  # a rotation error below it is a success (paper §4)

@@ -1,4 +1,4 @@
-"""What the paper prints (METHOD 10): its own data and weights, quoted beside ours and never to be compared with them.
+"""What the paper prints (paper §4): its own data and weights, quoted beside ours and never to be compared with them.
 
 How its published code really computes some of these figures is said in `CAVEATS`.
 """

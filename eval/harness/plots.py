@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy import stats
 
 from eval.harness.extra import library
 from eval.scores.figures import Record, Row
-from more2_jax.metrics import ecdf
 
 ENDINGS = ("png", "svg")
 
@@ -40,11 +40,13 @@ def draw_ecdf(
     """Share of records with an error at or below each value; one line a value of `by`. Failures never arrive."""
     figure, axes = pyplot().subplots(figsize=(5, 3.6))
     for name in dict.fromkeys(str(r[by]) for r in records if key in r):
-        own = [r[key] for r in records if str(r[by]) == name and key in r]
-        values, _ = ecdf([v for v in own if v is not None and v <= limit])
-        share = np.arange(len(values) + 1) / len(own)  # of all, also those that failed or lie beyond
-        steps = np.append(share, share[-1])
-        axes.step([0, *values, limit], steps, where="post", label=f"{name} ({len(own)})")
+        own = np.array([r[key] for r in records if str(r[by]) == name and key in r], float)
+        reached = own[
+            own <= limit
+        ]  # the rest failed (NaN) or lies beyond: censored there, and of the whole all the same
+        cdf = stats.ecdf(stats.CensoredData(reached, right=np.full(len(own) - len(reached), limit))).cdf
+        share = [0.0, *cdf.probabilities]
+        axes.step([0, *cdf.quantiles, limit], [*share, share[-1]], where="post", label=f"{name} ({len(own)})")
     axes.set(xlabel=label, ylabel="share", xlim=(0, limit), ylim=(0, 1))
     axes.grid(alpha=0.3)
     axes.legend(fontsize=7)

@@ -1,4 +1,4 @@
-"""Rows of figures as tables: one line a method, one column a figure, the columns of METHOD 9 kept apart."""
+"""Rows of figures as tables: one line a method, one column a figure, the columns of paper §4 kept apart."""
 
 from __future__ import annotations
 

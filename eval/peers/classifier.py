@@ -23,13 +23,14 @@ from rich.progress import track
 from eval.harness.batched import embed_all
 from eval.peers.learned_decoders import drawn
 from eval.peers.matching import Matched, Matcher, assigned
-from more2_jax.config import PriorConfig, TrainingConfig, TrainingRun, load_config
+from more2_jax.config import PriorConfig, load_config
 from more2_jax.network.prior import Prior, encode_ordered, load_prior, save_prior
 from more2_jax.types import Instance
 from train.prior import started_cold
 from train.run.program import run
 from train.run.schedule import learning_rate
-from train.run.shape_mix import load_mix
+from train.run.settings import TrainingConfig, TrainingRun
+from train.run.shape_mix import load_mix, open_mix
 from train.shards.sampling import TrainingSample
 from train.shards.shards import open_shards
 
@@ -49,7 +50,7 @@ def main(config: Path, shards: tuple[Path, ...], out: Path, steps: int = 600) ->
     training = dataclasses.replace(settings.training, steps=steps)
     shapes, rows = load_mix(shards, "train")
     names, labels = categories(list(dict.fromkeys(shards)))
-    prior = started_cold(settings, shapes, "classifier")
+    prior = started_cold(settings, open_mix(shards, "train"), "classifier")
     head = jnp.zeros((prior.config.encoder.code, len(names)))
     params: dict[str, Any] = {"encoder": prior.params["encoder"], "head": head}
     state: Any = optimizer(training).init(params)

@@ -17,10 +17,10 @@ import optax
 from jax import Array
 from jaxtyping import Float, Int
 
-from more2_jax.config import TrainingConfig
 from more2_jax.network.decoder import WeightNormDense
 from more2_jax.network.prior import Prior, encode_ordered
 from more2_jax.types import Embedding
+from train.run.settings import TrainingConfig
 from train.shards.losses import sdf_loss
 from train.shards.sampling import TrainingSample, sample_batch
 from train.shards.shards import Shapes

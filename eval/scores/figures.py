@@ -7,11 +7,14 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
+from jaxtyping import Float
+from scipy import stats
 
 Record = dict[str, Any]  # one pair, object or scan pair; None stands for a failure
 Column = Literal["paper", "published", "strict", ""]
 COLUMNS: tuple[Column, ...] = ("paper", "published", "strict")
-DRAWS = 500  # of the bootstrap
+DRAWS = 500  # of the bootstrap over scenes
+MEAN_DRAWS = 2000  # of the bootstrap of a mean
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -139,6 +142,17 @@ def interval(figure: Figure, arrays: Sequence[np.ndarray]) -> tuple[float, float
         return None
     low, high = np.quantile(draws, [0.025, 0.975]) * figure.scale
     return float(low), float(high)
+
+
+def mean_ci95(values: Sequence[float] | Float[np.ndarray, " n"]) -> tuple[float, float]:
+    """95 % interval of the mean by resampling: the value itself of one, NaN of nothing."""
+    data = np.asarray(values, float)
+    if len(data) < 2:
+        bound = float(data[0]) if len(data) else float("nan")
+        return bound, bound
+    rng = np.random.default_rng(0)
+    found = stats.bootstrap((data,), np.mean, n_resamples=MEAN_DRAWS, method="percentile", rng=rng)
+    return float(found.confidence_interval.low), float(found.confidence_interval.high)
 
 
 def rows_of(

@@ -1,4 +1,4 @@
-"""Scores of one assignment between two scans (METHOD 9), in three columns.
+"""Scores of one assignment between two scans (paper §4), in three columns.
 
 `paper`: a match is right if it names the very object. `published`: a copy is as good, however often it is named.
 `strict`: a copy is as good, but only once; matches of objects that have no partner count against F1.
@@ -9,10 +9,10 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import numpy as np
+from jaxtyping import Int
 
 from eval.data.masks import LOST
 from eval.data.truth import KnownObject, KnownScene
-from more2_jax.metrics import instance_recall
 
 Matched = Mapping[int, int]  # instance of the earlier scan → instance of the later
 
@@ -49,7 +49,7 @@ def count_right(
 
 
 def strict_count(scene: KnownScene, a: int, b: int, matched: Matched, true: Sequence[KnownObject]) -> int:
-    """Copies may stand in for one another, each once (`metrics.instance_recall`)."""
+    """Copies may stand in for one another, each once (`instance_recall`)."""
     true = [o for o in true if LOST not in (o.instance[a], o.instance[b])]  # no match of those is right
     if not true:
         return 0
@@ -62,3 +62,16 @@ def strict_count(scene: KnownScene, a: int, b: int, matched: Matched, true: Sequ
     )
     truth = np.array([ids.index(o.instance[b]) for o in true])
     return round(instance_recall(predicted, truth, same) * len(true))
+
+
+def instance_recall(
+    predicted: Int[np.ndarray, " n"], truth: Int[np.ndarray, " n"], same: Int[np.ndarray, " m"]
+) -> float:
+    """Correct matches over true matches; −1 means no partner. NaN when nothing has a partner.
+
+    `same[j]` is equal for targets that are identical copies: each may stand in for the other, but only
+    once: a target that several sources claim is right for one of them.
+    """
+    has = truth >= 0
+    right = has & (predicted >= 0) & (same[np.maximum(predicted, 0)] == same[np.maximum(truth, 0)])
+    return float(len(np.unique(predicted[right])) / has.sum()) if has.any() else float("nan")

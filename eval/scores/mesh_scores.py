@@ -1,4 +1,4 @@
-"""Scores of one mesh against the true one (METHOD 9), in three columns.
+"""Scores of one mesh against the true one (paper §4), in three columns.
 
 `paper`: the printed formulas, canonical units (longest edge 0.9). `published`: as the published code computes them:
 its Chamfer-L1 is squared and against vertices, its IoU the share of true vertices inside. `strict`: meters, true
@@ -16,7 +16,6 @@ from scipy.spatial import KDTree
 
 from eval.data.truth import KnownObject, Pose
 from more2_jax.geometry.poses import Points, apply_pose
-from more2_jax.metrics import inside, sdf_recall, volume_iou
 from more2_jax.types import Mesh
 
 Scores = dict[str, float | None]
@@ -114,9 +113,20 @@ def to_surface(points: Points, mesh: trimesh.Trimesh) -> Float[np.ndarray, " n"]
     return np.abs(pcu.closest_points_on_mesh(points, vertices, faces)[0])
 
 
+def sdf_recall(vertices_true: Points, mesh: trimesh.Trimesh, threshold: float) -> float:
+    """Share of true vertices closer to the predicted surface than `threshold` (in the vertices' unit)."""
+    return float(np.mean(to_surface(vertices_true, mesh) < threshold))
+
+
 def f_score(precision: float, recall: float) -> float:
     """Harmonic mean; 0 if both are."""
     return 2 * precision * recall / (precision + recall) if precision + recall else 0.0
+
+
+def volume_iou(predicted: Bool[np.ndarray, " q"], truth: Bool[np.ndarray, " q"]) -> float:
+    """Intersection over union of two solids, from inside tests at the same points; 0 when both are empty."""
+    union = (predicted | truth).sum()
+    return float((predicted & truth).sum() / union) if union else 0.0
 
 
 def joint_iou(found: trimesh.Trimesh, true: trimesh.Trimesh, samples: int) -> float:
@@ -129,7 +139,7 @@ def joint_iou(found: trimesh.Trimesh, true: trimesh.Trimesh, samples: int) -> fl
 def enclosed(mesh: trimesh.Trimesh, points: Points) -> Bool[np.ndarray, " n"]:
     """Inside tests; of an open surface, where it winds around the point more than half."""
     if mesh.is_watertight:
-        return inside(mesh, points)
+        return np.asarray(mesh.contains(points), bool)
     faces, vertices = np.asarray(mesh.faces, np.int32), np.asarray(mesh.vertices, np.float64)
     return (
         np.asarray(pcu.triangle_soup_fast_winding_number(vertices, faces, np.ascontiguousarray(points))) > 0.5

@@ -1,4 +1,4 @@
-"""Scores of one pose (METHOD 9), in three columns.
+"""Scores of one pose (paper §4), in three columns.
 
 `paper`: the printed formula. `published`: as the published code computes it. `strict`: over the object's own
 symmetry group, in meters. A failure has None for every score.
@@ -7,11 +7,16 @@ symmetry group, in meters. A failure has None for every score.
 from __future__ import annotations
 
 import numpy as np
-from scipy.spatial import KDTree
 
 from eval.data.truth import KnownObject
+from eval.scores.pose_distances import (
+    as_published_chamfer,
+    as_published_rmse,
+    modified_chamfer,
+    modified_chamfer_distance,
+    transformation_rmse,
+)
 from more2_jax.geometry.poses import Points, Pose, apply_pose, rotation_error_deg
-from more2_jax.metrics import as_published_rmse, modified_chamfer, transformation_rmse, translation_error
 from train.furniture.symmetry import equivalent_poses
 
 Scores = dict[str, float | None]
@@ -60,16 +65,16 @@ def pose_scores(
         "re_deg.paper": rotation_error_deg(T[:3, :3], T_true[:3, :3]),
         "re_deg.published": forgiven(rotation_error_deg(T[:3, :3], T_true[:3, :3]), truth.forgiven_deg),
         "re_deg.strict": min(rotation_error_deg(T[:3, :3], P[:3, :3]) for P in poses),
-        "te_m.paper": translation_error(T[:3, 3], T_true[:3, 3]),
+        "te_m.paper": float(np.linalg.norm(T[:3, 3] - T_true[:3, 3])),
         "te_m.strict": min(
-            translation_error(apply_pose(T, middle)[0], apply_pose(P, middle)[0]) for P in poses
+            float(np.linalg.norm(apply_pose(T, middle) - apply_pose(P, middle))) for P in poses
         ),
         "rmse_m.paper": transformation_rmse(T, T_true, source, target),
         "rmse_m.published": as_published_rmse(T, T_true, source, target),
         "rmse_m.strict": min(transformation_rmse(T, P, source, target) for P in poses),
         "cd_m2.paper": modified_chamfer(T, T_true, source, target),
-        "cd_m2.published": published_chamfer(T, T_true, source, target),
-        "cd_m.strict": min(chamfer_distance(T, P, source, target) for P in poses[:4]),
+        "cd_m2.published": as_published_chamfer(T, T_true, source, target),
+        "cd_m.strict": min(modified_chamfer_distance(T, P, source, target) for P in poses[:4]),
     }
     return {k: float(v) for k, v in scores.items() if v is not None}
 
@@ -82,19 +87,3 @@ def evenly(points: Points, count: int = POINTS) -> Points:
 def forgiven(error_deg: float, angles_deg: tuple[float, ...]) -> float:
     """The least of an error and its distance to each of the angles, about whatever axis."""
     return min([error_deg, *(abs(a - error_deg) for a in angles_deg)])
-
-
-def published_chamfer(T: Pose, T_true: Pose, source: Points, target: Points) -> float:
-    """As the published code has it: moved source to raw target, and target to itself moved by T T_true⁻¹, squared."""
-    there = KDTree(target).query(apply_pose(T, source))[0]
-    back = KDTree(apply_pose(T @ np.linalg.inv(T_true), target)).query(target)[0]
-    return float(np.mean(there**2) + np.mean(back**2))
-
-
-def chamfer_distance(T: Pose, T_true: Pose, source: Points, target: Points) -> float:
-    """The paper's modified chamfer as a distance: not squared, and the mean of both ways, meters."""
-    whole_target = np.concatenate([target, apply_pose(T_true, source)])
-    whole_source = np.concatenate([source, apply_pose(np.linalg.inv(T_true), target)])
-    there = KDTree(whole_target).query(apply_pose(T, source))[0]
-    back = KDTree(whole_source).query(apply_pose(np.linalg.inv(T), target))[0]
-    return float((there.mean() + back.mean()) / 2)

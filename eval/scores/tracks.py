@@ -13,7 +13,6 @@ from eval.data.truth import KnownObject, KnownScene, Pose
 from eval.scores.figures import COLUMNS, Record
 from eval.scores.mesh_scores import RECONSTRUCTED, mesh_scores
 from eval.scores.pose_scores import failed_pose, pose_scores
-from more2_jax.metrics import f1
 from more2_jax.tracking.objects import accumulated_points
 from more2_jax.types import LivingScene, Mesh
 
@@ -115,3 +114,10 @@ def changes_f1(scene: KnownScene, tracks: Sequence[Track]) -> float:
             found |= {f"added {k} {p[k]}" for p in presence if k in p and k - 1 not in p}
             found |= {f"removed {k} {p[k - 1]}" for p in presence if k - 1 in p and k not in p}
     return f1(said, true)
+
+
+def f1(predicted: set[str], truth: set[str]) -> float:
+    """Harmonic mean of precision and recall of a set; 1 when both are empty."""
+    if not predicted and not truth:
+        return 1.0
+    return 2 * len(predicted & truth) / (len(predicted) + len(truth))

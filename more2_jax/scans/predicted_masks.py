@@ -1,4 +1,4 @@
-"""Predicted masks laid over a cloud: Mask3D and the ScanNet benchmark (METHOD 8), or NPZ."""
+"""Predicted masks laid over a cloud: Mask3D and the ScanNet benchmark (paper §4), or NPZ."""
 
 from __future__ import annotations
 

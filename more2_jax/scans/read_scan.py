@@ -46,7 +46,7 @@ def read_scan(
     Instances of fewer than `min_points` points are reported in `Scan.skipped`; sizes that look like another
     unit, in `Scan.warnings`. `masks` are predicted ones (`data.masks`): those scored `min_score` or more replace
     the scan's own. `segment="geometric"` cuts a cloud without instances into planes and clusters; `depth_frames`
-    reads the raw depth of 3RScan, not its mesh (METHOD 8).
+    reads the raw depth of 3RScan, not its mesh (paper §4).
 
     Raises ValueError, in one line, when the file is missing, unknown, damaged, has no instance property, has
     coordinates that are not finite, or no instance is left.

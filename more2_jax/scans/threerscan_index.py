@@ -1,4 +1,4 @@
-"""`3RScan.json` (METHOD 8): which scans show the same place, what moved between them, and how.
+"""`3RScan.json` (paper §4): which scans show the same place, what moved between them, and how.
 
 The file's matrices are 16 numbers, column by column; here they are row-major, float64, meters. Two of its
 directions differ, and this module turns both the same way:
@@ -23,7 +23,7 @@ from more2_jax.scans.files.rgbd_sequence import is_rigid
 from more2_jax.scans.segment_groups import whole_number
 from more2_jax.types import Skipped
 
-# The movable categories of the benchmark (METHOD 8).
+# The movable categories of the benchmark (paper §4).
 CATEGORIES = (
     *(
         "armchair",

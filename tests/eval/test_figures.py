@@ -1,6 +1,7 @@
 """Figures from records: every statistic by hand, failures in every denominator, intervals over scenes, tables."""
 
 import dataclasses
+import math
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,7 @@ import tyro
 from eval import registration
 from eval.harness.results import portable, words_of
 from eval.harness.tables import best, latex, markdown, markdown_table, number
-from eval.scores.figures import Figure, figure_row, in_columns, rows_of
+from eval.scores.figures import Figure, figure_row, in_columns, mean_ci95, rows_of
 
 A = {"one": [{"method": "m", "e": 1.0}, {"method": "m", "e": 9.0}], "two": [{"method": "m", "e": None}]}
 
@@ -93,6 +94,19 @@ def test_interval_of_a_ratio_by_a_plain_bootstrap():
     assert value("ratio", records, over="n").ci95 == pytest.approx(
         np.quantile(slow, [0.025, 0.975]), abs=0.02
     )
+
+
+def test_bootstrap_interval_agrees_with_the_normal_one():
+    values = np.random.default_rng(4).normal(5, 2, size=400)
+    low, high = mean_ci95(values)
+    error = 1.96 * values.std() / math.sqrt(400)
+    assert low == pytest.approx(values.mean() - error, abs=0.05)
+    assert high == pytest.approx(values.mean() + error, abs=0.05)
+
+
+def test_interval_of_a_mean_of_constants_of_one_and_of_nothing():
+    assert mean_ci95([2.0, 2.0]) == mean_ci95([2.0]) == (2, 2)
+    assert all(map(math.isnan, mean_ci95([])))
 
 
 def test_no_interval_of_one_scene_nor_of_failures():

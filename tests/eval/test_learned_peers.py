@@ -13,9 +13,9 @@ from sphere_shards import sphere_shards
 from eval import decoding
 from eval.peers import classifier
 from eval.peers.learned_decoders import VARIANTS, decoder_of, frame_of, loss_of, start
-from more2_jax.config import TrainingConfig
 from more2_jax.network.prior import load_prior, save_prior
 from more2_jax.types import Embedding
+from train.run.settings import TrainingConfig
 
 SMALL = """
 model:

@@ -11,8 +11,17 @@ from scipy.spatial.distance import cdist
 from eval.accumulation import coverage
 from eval.data.truth import KnownObject
 from eval.reconstruction import JOINT_STEPS, own_names, with_joint
-from eval.scores.mesh_scores import KEYS, enclosed, f_score, mesh_scores, no_mesh, surface_points
-from eval.scores.tracks import Track, changes_f1, score_tracks
+from eval.scores.mesh_scores import (
+    KEYS,
+    enclosed,
+    f_score,
+    mesh_scores,
+    no_mesh,
+    sdf_recall,
+    surface_points,
+    volume_iou,
+)
+from eval.scores.tracks import Track, changes_f1, f1, score_tracks
 from more2_jax.config import preset
 from more2_jax.types import Mesh
 from train.furniture.symmetry import SymmetryGroup
@@ -128,6 +137,41 @@ def test_an_open_surface_encloses_by_winding():
 @pytest.mark.parametrize(("p", "r", "f"), [(0, 0, 0), (1, 1, 1), (1, 0, 0), (0.5, 1, 2 / 3)])
 def test_f_score(p, r, f):
     assert f_score(p, r) == pytest.approx(f)
+
+
+def test_volume_iou():
+    a, b, none = np.array([1, 1, 1, 0], bool), np.array([0, 1, 1, 1], bool), np.zeros(4, bool)
+    assert volume_iou(a, b) == 0.5
+    assert volume_iou(a, a) == 1
+    assert volume_iou(a, ~a) == 0
+    assert volume_iou(none, none) == 0
+
+
+def test_iou_of_shifted_boxes_by_inside_tests():
+    box = trimesh.creation.box((1, 1, 1))
+    half = trimesh.creation.box((1, 1, 1), transform=pose(0, [0.5, 0, 0]))
+    points = np.random.default_rng(3).uniform([-0.5, -0.5, -0.5], [1, 0.5, 0.5], size=(4000, 3))
+    within = enclosed(box, points)
+    np.testing.assert_array_equal(within, np.abs(points).max(axis=1) < 0.5)
+    assert volume_iou(within, enclosed(half, points)) == pytest.approx(1 / 3, abs=0.03)
+
+
+def test_sdf_recall_of_a_plane_at_known_heights():
+    plane = trimesh.Trimesh([[-9, -9, 0], [9, -9, 0], [9, 9, 0], [-9, 9, 0]], [[0, 1, 2], [0, 2, 3]])
+    heights = np.array([[0, 0, 0.0], [1, 1, 0.04], [2, 0, -0.04], [0, 2, 0.06], [1, 0, -0.2]])
+    assert sdf_recall(heights, plane, 0.05) == pytest.approx(3 / 5)
+    assert sdf_recall(heights, plane, threshold=1.0) == 1
+    assert sdf_recall(heights + [0, 0, 5], plane, 0.05) == 0
+
+
+def test_f1():
+    assert f1({"a", "b"}, {"a", "b"}) == 1
+    assert f1({"a"}, {"b"}) == 0
+    assert f1(set(), set()) == 1
+    assert f1(set(), {"a"}) == 0
+    precision, recall = 1 / 3, 1 / 2
+    expected = 2 * precision * recall / (precision + recall)
+    assert f1({"a", "x", "y"}, {"a", "b"}) == pytest.approx(expected)
 
 
 def test_coverage_by_hand():

@@ -2,6 +2,7 @@
 
 import dataclasses
 import itertools
+import math
 
 import numpy as np
 import pytest
@@ -11,8 +12,9 @@ from scipy.spatial.distance import cdist
 from scipy.spatial.transform import Rotation
 
 from eval.data.masks import DAMAGES, LOST, associated, with_masks
-from eval.scores.match_scores import match_scores
-from eval.scores.pose_scores import KEYS, failed_pose, forgiven, pose_scores, published_chamfer
+from eval.scores.match_scores import instance_recall, match_scores
+from eval.scores.pose_distances import as_published_chamfer
+from eval.scores.pose_scores import KEYS, failed_pose, forgiven, pose_scores
 from train.furniture.symmetry import SymmetryGroup, candidates, equivalent_poses, measure
 
 RNG = np.random.default_rng(0)
@@ -150,7 +152,7 @@ def test_scores_against_slow_computations():
     move = lambda P, x: np.array([(P @ [*p, 1.0])[:3] for p in x])  # noqa: E731
     there = cdist(move(T, source), target, "sqeuclidean").min(axis=1).mean()
     back = cdist(target, move(T @ np.linalg.inv(T_true), target), "sqeuclidean").min(axis=1).mean()
-    assert published_chamfer(T, T_true, source, target) == pytest.approx(there + back)
+    assert as_published_chamfer(T, T_true, source, target) == pytest.approx(there + back)
     found = scores(T)
     assert found["cd_m2.published"] == pytest.approx(there + back)
     assert found["re_deg.strict"] == pytest.approx(12)
@@ -189,6 +191,32 @@ def test_match_scores(matched, paper, published, strict):
     assert (found["pairs"], found["right.paper"], found["right.published"]) == (4, paper, published)
     assert found["right.strict"] == strict
     assert found["f1.strict"] == pytest.approx(2 * strict / (4 + len(matched)))
+
+
+@pytest.mark.parametrize(
+    ("predicted", "expected"),
+    [
+        ([0, 1, 2, -1], 1),
+        ([0, 2, 1, -1], 1),  # targets 1 and 2 are copies: changed about, they are as good
+        ([1, 0, -1, 3], 0),
+        ([0, -1, 3, -1], 1 / 3),
+        ([0, 1, 2, 3], 1),  # a partner for an object that has none is not this metric's business
+    ],
+)
+def test_instance_recall(predicted, expected):
+    truth, same = np.array([0, 1, 2, -1]), np.array([0, 1, 1, 2])
+    assert instance_recall(np.array(predicted), truth, same) == pytest.approx(expected)
+
+
+def test_a_copy_counts_for_one_object_only():
+    # Both sources claim target 1; its copy, target 2, goes unclaimed. At most one of the two can be right.
+    truth, same = np.array([1, 2]), np.array([0, 1, 1])
+    assert instance_recall(np.array([1, 1]), truth, same) == 0.5
+
+
+def test_instance_recall_of_no_true_match():
+    same = np.array([0])
+    assert math.isnan(instance_recall(np.array([0, -1]), np.array([-1, -1]), same))
 
 
 def test_what_has_no_partner_is_no_pair_but_costs_precision():

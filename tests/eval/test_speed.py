@@ -10,8 +10,9 @@ from places import ROOT
 
 from eval.performance.stopwatch import Seconds, timed
 from eval.speed import clouds_and_queries, distances, interleaved, outputs, published_layers
-from more2_jax.config import TrainingRun, load_config
+from more2_jax.config import load_config
 from more2_jax.network.prior import init_prior
+from train.run.settings import TrainingRun
 
 
 @pytest.fixture(scope="module")

@@ -9,11 +9,12 @@ import oracles
 import pytest
 from places import ROOT
 
-from more2_jax.config import DecoderConfig, EncoderConfig, PriorConfig, TrainingRun, load_config
+from more2_jax.config import DecoderConfig, EncoderConfig, PriorConfig, load_config
 from more2_jax.network.decoder import Decoder, bfloat16_product
 from more2_jax.network.prior import field_sdf, init_prior, object_field, sdf, sdf_one
 from more2_jax.network.published_weights import prior_from_published
 from more2_jax.types import Embedding
+from train.run.settings import TrainingRun
 
 CONFIGS = ROOT / "configs"
 

@@ -8,11 +8,12 @@ from compiling import quick_jit
 from places import ROOT
 from scipy.spatial.transform import Rotation
 
-from more2_jax.config import EncoderConfig, PriorConfig, TrainingRun, load_config
+from more2_jax.config import EncoderConfig, PriorConfig, load_config
 from more2_jax.geometry.padding import pad_clouds
 from more2_jax.network.encoder import neighbor_counts, power_of_two
 from more2_jax.network.prior import Prior, encode, encode_one, init_prior
 from more2_jax.types import Embedding, PointCloud
+from train.run.settings import TrainingRun
 
 CONFIGS = ROOT / "configs"
 POINTS, BATCH = 512, 8  # what clouds are padded to and how many there are, of choice: compiled once a prior

@@ -12,11 +12,12 @@ import pytest
 from compiling import quick_jit
 from places import ROOT
 
-from more2_jax.config import TrainingRun, load_config
+from more2_jax.config import load_config
 from more2_jax.geometry.transform import move_embedding, scale_embedding
 from more2_jax.network.local_field import LEAST_SPREAD, LocalLookup, from_plane, local_width
 from more2_jax.network.prior import encode_one, init_prior, sdf_one
 from more2_jax.types import Anchors
+from train.run.settings import TrainingRun
 
 CHANNELS, BANDWIDTHS, INPUTS = 4, (0.1, 0.3), 6
 encoded, distance = jax.jit(encode_one), jax.jit(sdf_one)

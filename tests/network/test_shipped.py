@@ -19,12 +19,11 @@ from more2_jax.scans.demo import demo_scan_paths
 from more2_jax.scans.read_scan import read_scan
 
 LARGEST_MB = 16  # of a file of weights
-# `base` obeys the same laws, ten times as slowly.
-PRIORS = [pytest.param(n, marks=[pytest.mark.slow] * (n != "small")) for n in shipped_priors()]
+PRIORS = shipped_priors()
 
 
-def test_small_and_base_are_shipped_in_files_that_are_not_too_large():
-    assert shipped_priors() == ["base", "small"]
+def test_small_is_shipped_in_a_file_that_is_not_too_large():
+    assert shipped_priors() == ["small"]
     folder = Path(str(resources.files("more2_jax"))) / "assets" / "weights"
     assert all(p.stat().st_size <= LARGEST_MB * 1_000_000 for p in folder.iterdir())
 

@@ -22,7 +22,7 @@ from more2_jax.cli.main import Command
 
 PAGES = sorted((ROOT / "docs").rglob("*.md"))
 BLOCK = re.compile(r"^```(\w*)\n(.*?)^```", re.DOTALL | re.MULTILINE)
-PROGRAM = re.compile(r"python -m ((?:train|eval)\.\w+)")
+PROGRAM = re.compile(r"python -m ((?:train|eval)\.[\w.]+)")
 RUN_ELSEWHERE = {"gradients.md"}  # tests/test_docs.py runs it, and looks at the gradient
 SHELL_WORDS = {"python3", "pip", "source", "export", ".venv/bin/pip"}
 

@@ -8,8 +8,9 @@ import numpy as np
 from places import ROOT
 
 from more2_jax.cli.main import main
-from more2_jax.config import TrainingRun, load_config
+from more2_jax.config import load_config
 from more2_jax.storage.ply_files import write_points
+from train.run.settings import TrainingRun
 
 TINY = load_config(ROOT / "configs/tiny.yaml", TrainingRun).model
 # Few steps: the command line is under test here, not the method.

@@ -15,8 +15,9 @@ from train.furniture.collections import SourceMesh
 from train.furniture.procedural import procedural_mesh
 from train.furniture.source_mesh import VALIDATION_SHARE
 from train.run.program import run
+from train.run.shape_mix import load_mix
 from train.shards.shapes import make_shape
-from train.shards.shards import load_shapes, open_shards, read_meta, read_solids, write_shard
+from train.shards.shards import open_shards, read_meta, read_solids, write_shard
 from train.tools import census
 
 
@@ -139,12 +140,12 @@ def test_shards_open_by_split_mapped_or_in_memory(shards: Path):
     view = open_shards(shards, "train")
     assert [m["name"] for m in view.meta] == ["a", "c"]
     assert len(view) == 2
-    loaded = load_shapes(shards, "train", queries=100)
+    loaded, rows = load_mix([shards], "train")
     assert loaded.views.shape == (2, 24, 512, 3)
-    assert loaded.sdf_near.shape == (2, 100, 4)
-    np.testing.assert_array_equal(loaded.sdf_uniform[1], view[1]["sdf_uniform"][:100])
+    assert loaded.sdf_near.shape == (2, 300, 4)
+    np.testing.assert_array_equal(loaded.sdf_uniform[1], view[1]["sdf_uniform"])
+    np.testing.assert_array_equal(rows, [0, 1])
     assert len(open_shards([shards, shards], "train")) == 4
-    assert load_shapes(shards, "train", most=1).views.shape[0] == 1
     with pytest.raises(ValueError, match="no holiday shapes"):
         open_shards(shards, "holiday")
     with pytest.raises(ValueError, match="no shards"):

@@ -10,7 +10,7 @@ import pytest
 from compiling import quick_jit
 from scipy.optimize import linprog
 
-from more2_jax.config import TrainingConfig
+from train.run.settings import TrainingConfig
 from train.shards.augmentation import (
     EDGE_CELLS,
     EDGE_JUMP,
@@ -25,10 +25,9 @@ from train.shards.augmentation import (
     plane_patch,
     start_far_out,
 )
-from train.shards.depth_views import DISTANCE, HALF_FIELD, view_directions
 from train.shards.sampling import partial_cloud, sample_batch
 from train.shards.shards import Shapes
-from train.shards.stretching import stretched, stretched_sdf
+from train.shards.view_directions import DISTANCE, HALF_FIELD, view_directions
 
 KEYS = jax.random.split(jax.random.key(0), 200)
 CLOUD = jax.random.uniform(jax.random.key(1), (500, 3), minval=-0.45, maxval=0.45)
@@ -251,60 +250,6 @@ def test_flaws_happen_in_augmented_clouds_alone():
     changed = np.asarray((clean != flawed).any(axis=(1, 2))).mean()
     assert changed == pytest.approx(0.6, abs=0.11)
     np.testing.assert_array_equal(clean, clouds(*views, dataclasses.replace(CLEAN, **certain))[0])
-
-
-def test_a_jittered_center_shifts_cloud_and_queries_alike():
-    data, index, key = shapes(), jnp.arange(4), jax.random.key(8)
-    still = draw(key, data, index, CLEAN, 64)
-    moved = draw(key, data, index, dataclasses.replace(CLEAN, center_jitter=0.05), 64)
-    assert (still.center == 0).all()
-    assert 0.02 < np.std(moved.center) < 0.09
-    np.testing.assert_allclose(
-        moved.points - still.points, moved.center[:, :, None] + 0 * still.points, atol=1e-6
-    )
-    np.testing.assert_allclose(
-        moved.queries - still.queries, moved.center[:, :, None] + 0 * still.queries, atol=1e-6
-    )
-    np.testing.assert_array_equal(moved.sdf, still.sdf)
-
-
-def test_stretching_a_ball_scales_its_distance():
-    sphere, _ = seen_cloud(4000)
-    query = jax.random.uniform(KEYS[0], (200, 3), minval=-0.5, maxval=0.5)
-    sdf = jnp.linalg.norm(query, axis=-1) - 0.4
-    scaled = stretched_sdf(query, sdf, sphere, jnp.full(3, 1.3))
-    np.testing.assert_allclose(scaled, 1.3 * sdf, atol=1e-5)
-
-
-def test_distances_of_a_stretched_box_are_right_beside_its_faces():
-    half, factor = np.array([0.2, 0.3, 0.45]), np.array([1.15, 0.9, 1.0])
-    rng = np.random.default_rng(0)
-    surface = rng.uniform(-half, half, (6000, 3))
-    axis = rng.integers(0, 3, 6000)
-    surface[np.arange(6000), axis] = np.sign(surface[np.arange(6000), axis]) * half[axis]
-    query = surface[:500] + 0.05 * rng.normal(size=(500, 3))
-    label = stretched_sdf(
-        *(jnp.asarray(a, jnp.float32) for a in (query, box_sdf(query, half), surface, factor))
-    )
-    truth = box_sdf(query * factor, half * factor)
-    assert (np.sign(label) == np.sign(truth)).all()
-    assert np.abs(label - truth).mean() < 0.02 * CONFIG.near_surface
-    left_alone = np.abs(box_sdf(query, half) - truth).mean()
-    assert np.abs(label - truth).mean() < 0.5 * left_alone
-
-
-def box_sdf(query, half):
-    outside = np.abs(query) - half
-    return np.linalg.norm(np.maximum(outside, 0), axis=-1) + np.minimum(outside.max(axis=-1), 0)
-
-
-def test_stretched_shapes_keep_the_longest_edge():
-    box = jax.random.uniform(KEYS[1], (5000, 3), minval=-1, maxval=1) * jnp.array([0.2, 0.3, 0.45])
-    for key in KEYS[:10]:
-        points, queries, _ = stretched(key, box, box[:10], jnp.zeros(10), box, 0.3)
-        edges = np.ptp(np.asarray(points), axis=0)
-        assert edges.max() == pytest.approx(np.ptp(np.asarray(box)[:, 2]), rel=1e-5)
-        np.testing.assert_allclose(points[:10], queries, rtol=1e-6)
 
 
 def test_sampling_starts_at_the_kept_point_farthest_out():

@@ -9,9 +9,10 @@ from shapes import box_distance, sphere
 
 from train.furniture.closed_solids import canonical, solidify
 from train.furniture.procedural import procedural_mesh
-from train.shards.depth_views import POINTS_A_VIEW, VIEWS, coverage, depth_views, view_directions
+from train.shards.depth_views import POINTS_A_VIEW, coverage, depth_views
 from train.shards.shapes import fingerprint, make_shape
 from train.shards.signed_distance import BOX, check_signs, is_inside, signed_distances
+from train.shards.view_directions import VIEWS, view_directions
 
 QUERIES = 8000
 

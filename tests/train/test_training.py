@@ -15,11 +15,12 @@ from compiling import quick_jit
 from places import ROOT
 from sphere_shards import sphere_shards
 
-from more2_jax.config import TrainingRun, load_config
+from more2_jax.config import load_config
 from train.prior import started_warm
 from train.run.journal import Journal, read_log
 from train.run.pictures import EYE, splat
 from train.run.schedule import learning_rate
+from train.run.settings import TrainingRun
 from train.run.shape_mix import load_mix
 from train.shards.losses import (
     LEAST_CORRELATION,
@@ -33,7 +34,6 @@ from train.shards.losses import (
 )
 from train.shards.packed_shapes import read_shapes
 from train.shards.sampling import sample_batch
-from train.shards.shards import load_shapes
 from train.tools import pack
 
 
@@ -108,7 +108,7 @@ def test_a_warm_start_from_another_model_is_refused_in_one_line(run, change):
 
 def test_gradients_of_the_training_loss_are_finite(shards, run, tiny_prior):
     draw = quick_jit(sample_batch, static_argnames=("config", "points"))
-    sample = draw(jax.random.key(0), load_shapes(shards, "train"), jnp.arange(4), run.training, points=64)
+    sample = draw(jax.random.key(0), load_mix([shards], "train")[0], jnp.arange(4), run.training, points=64)
 
     @quick_jit
     @jax.grad
@@ -144,7 +144,7 @@ def test_a_trapezoid_may_be_given_other_steps_while_it_is_flat(run):
 def test_packed_shapes_are_the_shards_to_within_a_step(shards, tmp_path):
     packed = tmp_path / "small.npz"
     pack.main((shards,), packed, shapes=10, val=4, views=2, points=32, queries=50)
-    small, whole = read_shapes(packed, "train"), load_shapes(shards, "train")
+    small, whole = read_shapes(packed, "train"), load_mix([shards], "train")[0]
     assert small.views.shape == (10, 2, 32, 3) and small.sdf_near.shape == (10, 50, 4)
     # Every packed shape is one of the shards', cut and rounded.
     cut = np.asarray(whole.views[:, :2, :32], np.float64)

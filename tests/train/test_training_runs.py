@@ -34,25 +34,27 @@ import dataclasses, json, sys
 from pathlib import Path
 import jax, numpy as np
 from jax.sharding import Mesh
-from more2_jax.config import TrainingRun, load_config
+from more2_jax.config import load_config
+from train.run.settings import TrainingRun
 from more2_jax.network.prior import init_prior
 from train.run.devices import ROWS, everywhere
-from train.run.shape_mix import load_mix
+from train.run.batches import resident
+from train.run.shape_mix import open_mix
 from train.run.state import initial_state, training_step
 
 settings = load_config(sys.argv[1], TrainingRun)
-shapes, rows = load_mix([Path(sys.argv[2])], "train")
+mix = open_mix([Path(sys.argv[2])], "train")
 found = {}
 for count in (1, 4):
     mesh = Mesh(np.array(jax.devices()[:count]), (ROWS,))
     prior = init_prior(settings.model, jax.random.key(0))
     state = everywhere(mesh, initial_state(prior, settings.training))
-    data = everywhere(mesh, (shapes, jax.numpy.asarray(rows)))
+    batches = resident(mix, settings.training, mesh)
     how = dict(model=settings.model, config=settings.training, mesh=mesh)
-    step = training_step.lower(state, *data, **how).compile()
+    step = training_step.lower(state, *next(batches(0)), **how).compile()
     losses = []
-    for _ in range(4):
-        state, terms = step(state, *data)
+    for _, batch in zip(range(4), batches(0)):
+        state, terms = step(state, *batch)
         losses.append({k: float(v) for k, v in terms.items()})
     flat = np.concatenate([np.ravel(x) for x in jax.tree.leaves(state.params)]).astype(float)
     found[count] = {"losses": losses, "params": flat.tolist(), "flops": step.cost_analysis()["flops"]}

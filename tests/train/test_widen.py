@@ -12,9 +12,10 @@ from compiling import quick_jit
 from flax.traverse_util import flatten_dict
 from places import ROOT
 
-from more2_jax.config import DecoderConfig, EncoderConfig, PriorConfig, TrainingRun, load_config
+from more2_jax.config import DecoderConfig, EncoderConfig, PriorConfig, load_config
 from more2_jax.geometry.points import farthest_points
 from more2_jax.network.prior import Prior, encode_ordered, init_prior, load_prior, sdf_one
+from train.run.settings import TrainingRun
 from train.tools import widen as program
 from train.tools.widen import source_layer, widen
 

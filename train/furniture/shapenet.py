@@ -11,7 +11,7 @@ from typing import cast
 from train.furniture.mesh_files import Report, attempt, read_mesh_file
 from train.furniture.source_mesh import SourceMesh, Split
 
-# The seven classes that the method is trained on (METHOD 2).
+# The seven classes that the method is trained on (paper §3.1).
 SYNSETS = {
     "02747177": "trash can",
     "02818832": "bed",

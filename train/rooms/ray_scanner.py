@@ -1,4 +1,4 @@
-"""Rooms of furniture scanned by a depth camera, with ground truth: METHOD 7 with what real scans add.
+"""Rooms of furniture scanned by a depth camera, with ground truth: FlyingShape (paper §4) with what real scans add.
 
 Every object's pose, every point's object and every model are known. Deterministic by seed.
 """

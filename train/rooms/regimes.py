@@ -13,7 +13,7 @@ from train.rooms.visits import FlyingConfig
 
 Regime = Literal["paper", "sparse", "identical", "changes"]
 REGIMES: tuple[Regime, ...] = get_args(Regime)
-OBJECTS = (4, 8)  # in a scene, least and most (METHOD 7)
+OBJECTS = (4, 8)  # in a scene, least and most (paper §4)
 CHANGES_OBJECTS = (6, 8)  # so that every role is played and two objects move
 COPIES = (2, 4)  # of the same model in a scene of `identical`
 TWIN_SCALE = (0.04, 0.08)  # by how much a near-twin is larger or smaller along each axis

@@ -1,4 +1,4 @@
-"""Rooms visited several times: which objects stand where at every visit, and the scans of it (METHOD 7).
+"""Rooms visited several times: which objects stand where at every visit, and the scans of it (paper §4).
 
 `flying_scene` makes scenes for evaluation from any furniture. Deterministic by the generator's seed.
 """
@@ -28,7 +28,7 @@ SAMPLES = 1024  # of an object's surface, on which visibility is measured
 
 @dataclass(frozen=True)
 class FlyingConfig:
-    """A furnished room and its visits. `paper` is METHOD 7; `sparse` adds what real scans have.
+    """A furnished room and its visits. `paper` is FlyingShape (paper §4); `sparse` adds what real scans have.
 
     `paper`: three clean depth images of the room from the upper hemisphere.
     `sparse`: cameras on one side of the room at a person's height, occlusion, noise, dropout, a floor.

@@ -1,8 +1,13 @@
-"""Keeps memory that a step gives back, for the next step to take."""
+"""How much memory there is, and keeping what a step gives back, for the next step to take."""
 
 from __future__ import annotations
 
 import ctypes
+import os
+from contextlib import suppress
+from pathlib import Path
+
+import jax
 
 TRIM_THRESHOLD, TOP_PAD, MMAP_THRESHOLD = -1, -2, -3  # of mallopt, in glibc's malloc.h
 LIMIT = 2**30  # glibc takes no larger threshold on all machines; a block beyond it is mapped
@@ -25,3 +30,14 @@ def keep_freed_memory() -> bool:
     if mallopt is None:
         return False
     return all([mallopt(option, value) == 1 for option, value in OPTIONS])
+
+
+def memory_bytes() -> int:
+    """Of the first device, or of the machine (of the container, where one is limited) if that is a CPU."""
+    device = jax.local_devices()[0]
+    if device.platform != "cpu":
+        return int(device.memory_stats()["bytes_limit"])  # pyright: ignore[reportOptionalSubscript]
+    found = [os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")]
+    with suppress(OSError, ValueError):  # no such file, or "max"
+        found.append(int(Path("/sys/fs/cgroup/memory.max").read_text()))
+    return min(found)

@@ -9,10 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from more2_jax.config import MeshingConfig, TrainingConfig
+from more2_jax.config import MeshingConfig
 from more2_jax.meshing.extract import extract_mesh
 from more2_jax.network.prior import Prior, encode_ordered
 from more2_jax.types import Mesh
+from train.run.settings import TrainingConfig
 from train.shards.sampling import sample_batch
 from train.shards.shards import Shapes
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import optax
 
-from more2_jax.config import TrainingConfig
+from train.run.settings import TrainingConfig
 
 PUBLISHED = {0.6: 0.3, 0.75: 0.3, 0.9: 0.3}  # share of the steps: factor from there on
 LAST = 0.01  # share of the peak that the cosine and the trapezoid end at
@@ -12,7 +12,7 @@ FALL = 0.2  # share of the steps in which the trapezoid falls
 
 
 def learning_rate(config: TrainingConfig) -> optax.Schedule:
-    """A linear warm-up, then a cosine to 1 % of the peak, the published steps (METHOD 2), or a trapezoid.
+    """A linear warm-up, then a cosine to 1 % of the peak, the published steps (paper §3.1), or a trapezoid.
 
     The trapezoid stays at the peak until its last fifth falls in a line to 1 %: as long as it stays, a stopped run may
     go on with another number of steps as if it had been meant from the start.

@@ -1,9 +1,9 @@
-"""The shapes a run draws from: every source once in memory, drawn from as often as it is named."""
+"""The shapes a run draws from: every source once, drawn from as often as it is named."""
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import jax
@@ -12,26 +12,67 @@ import numpy as np
 from jaxtyping import Int
 
 from train.shards.packed_shapes import read_shapes
-from train.shards.shards import Shapes, load_shapes
+from train.shards.shards import MAPPED, Shapes, ShardView, open_shards
+
+MOST_QUERIES = 16_000  # of each kind, a shape: the first ones, their order being random already
+
+
+@dataclass(frozen=True, kw_only=True)
+class ShapeMix:
+    """The shapes of several sources, on disk until they are read."""
+
+    views: tuple[ShardView, ...]  # of each source
+    rows: Int[np.ndarray, " rows"]  # to draw from: a shape of a source named twice stands there twice
+    queries: Mapping[str, int]  # how many of each kind are read of a shape
+
+    def __len__(self) -> int:
+        return sum(map(len, self.views))
+
+    @property
+    def nbytes(self) -> int:
+        """Of all shapes in memory."""
+        return sum(array.nbytes for array in vars(self.read([0])).values()) * len(self)
+
+    def read(self, index: Iterable[int]) -> Shapes:
+        """The shapes `index`, as NumPy arrays; one after the other, so that no second copy is made."""
+        first = np.cumsum([0, *map(len, self.views)])
+        rows: dict[str, list[np.ndarray]] = {name: [] for name in MAPPED}
+        for i in index:
+            source = int(np.searchsorted(first, i, side="right")) - 1
+            stored = self.views[source][i - first[source]]
+            for name, kept in rows.items():
+                kept.append(stored[name][: self.queries.get(name)])
+        return Shapes(**{name: np.stack(kept) for name, kept in rows.items()})  # pyright: ignore[reportArgumentType]
+
+
+def open_mix(sources: Sequence[Path], split: str) -> ShapeMix:
+    """Opens the shapes of a split ('train', 'val', 'test').
+
+    A source is a folder of shards, which stays on disk, or a file of `train.tools.pack`. Raises ValueError where the
+    split is empty or sources differ in views or points a shape; queries are cut to the smallest source's.
+    """
+    once = list(dict.fromkeys(sources))
+    views = tuple(
+        in_memory(read_shapes(s, split)) if s.suffix == ".npz" else open_shards(s, split) for s in once
+    )
+    shape = [{name: array.shape for name, array in view[0].items()} for view in views]
+    if len({s["views"] for s in shape}) > 1:
+        got = ", ".join(f"{path}: {s['views'][:2]}" for path, s in zip(once, shape, strict=True))
+        raise ValueError(f"views and points a shape differ ({got}); needed the same in all sources")
+    first = np.cumsum([0, *map(len, views)])
+    rows = np.concatenate([np.arange(first[k], first[k + 1]) for k in map(once.index, sources)])
+    least = {n: min(MOST_QUERIES, *(s[n][0] for s in shape)) for n in ("sdf_uniform", "sdf_near")}
+    return ShapeMix(views=views, rows=rows, queries=least)
+
+
+def in_memory(shapes: Shapes) -> ShardView:
+    """Shapes that are read already, as a view of one shard."""
+    arrays = {name: np.asarray(getattr(shapes, name)) for name in MAPPED}
+    rows = tuple((0, k) for k in range(len(arrays["views"])))
+    return ShardView(shards=(arrays,), rows=rows, meta=({},) * len(rows))
 
 
 def load_mix(sources: Sequence[Path], split: str) -> tuple[Shapes, Int[np.ndarray, " rows"]]:
-    """The shapes of a split, and the rows to draw from: those of a source named twice stand there twice.
-
-    A source is a folder of shards or a file of `train.tools.pack`. Raises ValueError where the split is empty or
-    sources differ in views or points a shape; queries are cut to the smallest source's.
-    """
-    once = list(dict.fromkeys(sources))
-    loaded = [read_shapes(s, split) if s.suffix == ".npz" else load_shapes(s, split) for s in once]
-    if len({s.views.shape[1:] for s in loaded}) > 1:
-        got = ", ".join(f"{path}: {s.views.shape[1:3]}" for path, s in zip(once, loaded, strict=True))
-        raise ValueError(f"views and points a shape differ ({got}); needed the same in all sources")
-    first = np.cumsum([0, *(len(s.views) for s in loaded)])
-    rows = [np.arange(first[k], first[k + 1]) for k in map(once.index, sources)]
-    least = {name: min(getattr(s, name).shape[1] for s in loaded) for name in ("sdf_uniform", "sdf_near")}
-    cut = [
-        dataclasses.replace(s, **{name: getattr(s, name)[:, :n] for name, n in least.items()}) for s in loaded
-    ]
-    if len(cut) == 1:  # a copy less of what may be gigabytes
-        return cut[0], np.concatenate(rows)
-    return jax.tree.map(lambda *arrays: jnp.concatenate(arrays), *cut), np.concatenate(rows)
+    """The shapes of a split on the default device, and the rows to draw from. ValueError as `open_mix`."""
+    mix = open_mix(sources, split)
+    return jax.tree.map(jnp.asarray, mix.read(range(len(mix)))), mix.rows

@@ -11,12 +11,14 @@ import jax.numpy as jnp
 import optax
 from jax import Array
 from jax.sharding import Mesh
+from jaxtyping import Int
 
-from more2_jax.config import PriorConfig, TrainingConfig
+from more2_jax.config import PriorConfig
 from more2_jax.network.prior import Prior
 from more2_jax.types import pytree
 from train.run.devices import by_rows
 from train.run.schedule import learning_rate
+from train.run.settings import TrainingConfig
 from train.shards.losses import total_loss
 from train.shards.sampling import TrainingSample, sample_batch
 from train.shards.shards import Shapes
@@ -49,15 +51,16 @@ def initial_state(prior: Prior, config: TrainingConfig) -> TrainingState:
 
 
 def draw(
-    shapes: Shapes, rows: Array, step: Array, model: PriorConfig, config: TrainingConfig, mesh: Mesh
+    shapes: Shapes,
+    index: Int[Array, " b"],
+    step: Array,
+    model: PriorConfig,
+    config: TrainingConfig,
+    mesh: Mesh,
 ) -> tuple[TrainingSample, Array]:
-    """The batch of a step and the key of its dropout: functions of (seed, step) alone, whatever the devices.
-
-    `rows` lists the shapes to draw from; a shape that stands in it twice is drawn twice as often.
-    """
+    """Samples of shapes `index` and the key of the step's dropout: the same whatever the devices."""
     key = jax.random.fold_in(jax.random.key(config.seed), step)
-    index_key, sample_key, dropout_key = jax.random.split(key, 3)
-    index = rows[jax.random.randint(index_key, (config.batch,), 0, len(rows))]
+    sample_key, dropout_key = jax.random.split(key)
     sample = sample_batch(sample_key, shapes, index, config, model.encoder.points)
     return jax.lax.with_sharding_constraint(sample, by_rows(mesh)), dropout_key
 
@@ -66,18 +69,18 @@ def draw(
 def training_step(
     state: TrainingState,
     shapes: Shapes,
-    rows: Array,
+    index: Int[Array, " b"],
     *,
     model: PriorConfig,
     config: TrainingConfig,
     mesh: Mesh,
 ) -> tuple[TrainingState, dict[str, Array]]:
-    """One Adam step; returns the new state and the loss terms.
+    """One Adam step on shapes `index`; returns the new state and the loss terms.
 
     The loss is that of the whole batch: JAX splits it over the rows of `mesh` and exchanges what rows share,
     which is the codes of the contrast term and the gradient.
     """
-    sample, dropout_key = draw(shapes, rows, state.step, model, config, mesh)
+    sample, dropout_key = draw(shapes, index, state.step, model, config, mesh)
 
     def loss(params: dict[str, Any]) -> tuple[Array, dict[str, Array]]:
         prior = Prior(params=params, config=model)

@@ -8,21 +8,22 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from more2_jax.config import TrainingConfig
 from more2_jax.geometry.points import kabsch_rotation
 from more2_jax.network.prior import Prior
+from train.run.settings import TrainingConfig
 from train.shards.losses import predict
 from train.shards.sampling import TrainingSample, sample_batch
 from train.shards.shards import Shapes
 
 GROUP = 8  # objects a scene, for matching
+MOST_VALIDATED = 192  # shapes
 BATCH = 32
 
 
 def validate(prior: Prior, shapes: Shapes, config: TrainingConfig) -> dict[str, float]:
-    """Means over up to 192 shapes, clean clouds of up to three views: the same samples at every call."""
+    """Means over up to `MOST_VALIDATED` shapes, clean clouds of up to three views: the same samples at every call."""
     clean = dataclasses.replace(config, max_views=3, augment_probability=0.0, queries=1024)
-    count = min(192, len(shapes.views)) // GROUP * GROUP
+    count = min(MOST_VALIDATED, len(shapes.views)) // GROUP * GROUP
     batch = min(BATCH, count)
     rows = [
         _scores(prior, shapes, jnp.arange(i, i + batch), i, clean) for i in range(0, count - batch + 1, batch)

@@ -1,4 +1,4 @@
-"""Flaws of real scans, put into training clouds (METHOD 2): pure functions of (key, cloud), one cloud at a time.
+"""Flaws of real scans, put into training clouds (paper §3.1): pure functions of (key, cloud), one cloud at a time.
 
 Lengths in canonical units (longest edge 0.9); each flaw happens with a probability that may be traced. No rotation:
 the encoder is equivariant, a turned cloud gives turned features, so turning teaches it nothing.
@@ -12,8 +12,8 @@ import numpy as np
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
-from more2_jax.config import TrainingConfig
-from train.shards.depth_views import DISTANCE, HALF_FIELD, view_directions
+from train.shards.settings import SampleConfig
+from train.shards.view_directions import DISTANCE, HALF_FIELD, view_directions
 
 Cloud = Float[Array, "n 3"]
 Kept = Bool[Array, " n"]
@@ -39,7 +39,7 @@ def merge_views(
 
 
 def depth_noise(
-    key: Array, points: Cloud, view: Int[Array, " n"], config: TrainingConfig, probability: Chance
+    key: Array, points: Cloud, view: Int[Array, " n"], config: SampleConfig, probability: Chance
 ) -> tuple[Cloud, Kept]:
     """Points as a depth camera at their view's eye measures them, and True where it measures nothing.
 

@@ -1,4 +1,4 @@
-"""Depth maps of a shape from all around, back-projected: what partial clouds are drawn from (METHOD 2)."""
+"""Depth maps of a shape from all around, back-projected: what partial clouds are drawn from (paper §3.1)."""
 
 from __future__ import annotations
 
@@ -7,20 +7,10 @@ import trimesh
 from jaxtyping import Bool, Float, Int
 from trimesh.ray.ray_pyembree import RayMeshIntersector
 
-VIEWS = 24
+from train.shards.view_directions import DISTANCE, HALF_FIELD, view_directions
+
 POINTS_A_VIEW = 512
 PIXELS = 64  # a side
-DISTANCE = 1.6  # of the camera from the center, canonical units
-HALF_FIELD = 0.42  # tangent of half the field of view: the whole unit shape is seen
-
-
-def view_directions(count: int = VIEWS) -> Float[np.ndarray, "count 3"]:
-    """Unit directions spread evenly over the sphere (a Fibonacci spiral)."""
-    index = np.arange(count) + 0.5
-    z = 1 - 2 * index / count
-    angle = np.pi * (1 + 5**0.5) * index
-    ring = np.sqrt(1 - z * z)
-    return np.stack([ring * np.cos(angle), ring * np.sin(angle), z], axis=1)
 
 
 def pixel_rays(toward: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "r 3"]:

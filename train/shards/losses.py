@@ -1,4 +1,4 @@
-"""Training losses (METHOD 2), for one shape seen twice or a batch of codes."""
+"""Training losses (paper §3.1), for one shape seen twice or a batch of codes."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from jax import Array
 from jax.sharding import Mesh
 from jaxtyping import Float
 
-from more2_jax.config import TrainingConfig
 from more2_jax.network.decoder import Decoder
 from more2_jax.network.prior import Prior, encode_ordered
 from more2_jax.network.row_map import in_turn
 from more2_jax.types import Embedding
 from train.shards.sampling import TrainingSample
+from train.shards.settings import LossConfig
 
 AT_ONCE = 1024  # points of clouds that a CPU encodes side by side
 LEAST_CORRELATION = 0.05  # of two F_eqv, whose norms are 1: below it their rotation is noise, and pulls less
@@ -80,7 +80,7 @@ def rotation_loss(eqv: Float[Array, "b 2 3 c"]) -> Float[Array, ""]:
 def total_loss(
     prior: Prior,
     sample: TrainingSample,
-    config: TrainingConfig,
+    config: LossConfig,
     dropout_key: Array,
     mesh: Mesh | None = None,
 ) -> tuple[Float[Array, ""], dict[str, Float[Array, ""]]]:
@@ -91,7 +91,7 @@ def total_loss(
     embedding, predicted = predict(prior, sample, dropout_key, train=True, mesh=mesh)
     terms = {
         "sdf": sdf_loss(predicted, sample.sdf, config.near_surface),
-        "center": jnp.mean(jnp.linalg.norm(embedding.center - sample.center + 1e-12, axis=-1)),
+        "center": jnp.mean(jnp.linalg.norm(embedding.center + 1e-12, axis=-1)),
         # Where the paper has |1 − F_s|: the same minimum and slope there, but a scale that shrinks toward 0,
         # where |1 − F_s| has no pull left on the product of all layers, is pushed back.
         "scale": jnp.mean(jnp.abs(jnp.log(embedding.scale))),

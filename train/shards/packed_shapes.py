@@ -9,7 +9,6 @@ import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, UInt16
 
@@ -45,7 +44,7 @@ def write_shapes(path: Path, splits: Mapping[str, Mapping[str, np.ndarray]]) -> 
 
 
 def read_shapes(path: Path, split: str) -> Shapes:
-    """The shapes of a split. ValueError if the file is damaged or has none."""
+    """The shapes of a split, as NumPy arrays. ValueError if the file is damaged or has none."""
     try:
         with np.load(path, allow_pickle=False) as file:
             arrays = {k: file[k] for k in file.files if k.startswith(f"{split}/")}
@@ -55,7 +54,8 @@ def read_shapes(path: Path, split: str) -> Shapes:
         ) from error
     if missing := [name for name in MAPPED if f"{split}/{name}/low" not in arrays]:
         raise ValueError(f"{path}: no {split}/{missing[0]}; `python -m train.tools.pack` makes such files")
-    return Shapes(**{name: jnp.asarray(_array(arrays, f"{split}/{name}", LEVELS[name])) for name in MAPPED})
+    read = {name: _array(arrays, f"{split}/{name}", LEVELS[name]) for name in MAPPED}
+    return Shapes(**read)  # pyright: ignore[reportArgumentType]
 
 
 def _array(arrays: Mapping[str, np.ndarray], name: str, levels: int) -> Float[np.ndarray, "..."]:

@@ -10,7 +10,6 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
-from more2_jax.config import TrainingConfig
 from more2_jax.geometry.points import farthest_points
 from more2_jax.types import pytree
 from train.shards.augmentation import (
@@ -23,70 +22,49 @@ from train.shards.augmentation import (
     merge_views,
     start_far_out,
 )
+from train.shards.settings import SampleConfig
 from train.shards.shards import Shapes
-from train.shards.stretching import stretched
 
 LEAST_KEPT = 0.1  # of the points: a cloud of which cuts would leave less stays whole
 
 
 @pytree
 class TrainingSample:
-    """Two partial clouds of one shape, in farthest-point order, and points of known signed distance."""
+    """Two partial clouds of one shape, in farthest-point order, and points of known signed distance.
+
+    The frame is the shape's own, its center the origin. Nothing is shifted: the encoder centers its cloud itself, so a
+    shift of everything would move F_c as much and change nothing else. What makes F_c learned is that partiality moves
+    the mean of the cloud.
+    """
 
     points: Float[Array, "*b 2 n 3"]  # canonical units
     mask: Bool[Array, "*b 2 n"]
     queries: Float[Array, "*b 2 q 3"]
     sdf: Float[Array, "*b 2 q"]
-    center: Float[Array, "*b 2 3"]  # of the shape, in its cloud's frame: what F_c should be
 
 
 def sample_batch(
-    key: Array, shapes: Shapes, index: Int[Array, " b"], config: TrainingConfig, points: int
+    key: Array, shapes: Shapes, index: Int[Array, " b"], config: SampleConfig, points: int
 ) -> TrainingSample:
-    """Samples shapes `index`; sample i depends on (key, i, index[i], index[i − 1]) alone.
+    """Samples shapes `index`; sample i depends on (key, i) and on the shapes index[i] and index[i − 1] alone.
 
     `points` is the encoder's input size. Fragments that lie beside shape i are of shape i − 1 of the batch.
     """
-    return sample_rows(
-        row_keys(key, jnp.arange(len(index))), shapes, index, jnp.roll(index, 1), config, points
-    )
 
-
-def row_keys(key: Array, rows: Int[Array, " b"]) -> Array:
-    """The keys of rows of a batch."""
-    return jax.vmap(lambda row: jax.random.fold_in(key, row))(rows)
-
-
-def sample_rows(
-    keys: Array,
-    shapes: Shapes,
-    index: Int[Array, " b"],
-    other: Int[Array, " b"],
-    config: TrainingConfig,
-    points: int,
-) -> TrainingSample:
-    """One sample a key: of shape `index`, beside fragments of shape `other`."""
-
-    def one(key: Array, i: Array, j: Array) -> TrainingSample:
-        pair = jax.random.split(key)
+    def one(row: Array, i: Array, j: Array) -> TrainingSample:
+        pair = jax.random.split(jax.random.fold_in(key, row))
         return jax.vmap(lambda k: _half_sample(k, shapes, i, shapes.views[j], config, points))(pair)
 
-    return jax.vmap(one)(keys, index, other)
+    return jax.vmap(one)(jnp.arange(len(index)), index, jnp.roll(index, 1))
 
 
 def _half_sample(
-    key: Array, shapes: Shapes, index: Int[Array, ""], other: Array, config: TrainingConfig, count: int
+    key: Array, shapes: Shapes, index: Int[Array, ""], other: Array, config: SampleConfig, count: int
 ) -> TrainingSample:
-    cloud_key, query_key, stretch_key, jitter_key = jax.random.split(key, 4)
+    cloud_key, query_key = jax.random.split(key)
     points, mask = partial_cloud(cloud_key, shapes.views[index], other, config, count)
     queries, sdf = _queries(query_key, shapes, index, config.queries)
-    if config.stretch > 0:
-        surface = shapes.views[index].reshape(-1, 3)
-        points, queries, sdf = stretched(stretch_key, points, queries, sdf, surface, config.stretch)
-    # The encoder centers its cloud itself: a shift of everything shifts F_c as much and changes nothing else. What
-    # makes F_c learned is that queries stay canonical while partiality moves the mean of the cloud.
-    center = config.center_jitter * jax.random.normal(jitter_key, (3,))
-    return TrainingSample(points=points + center, mask=mask, queries=queries + center, sdf=sdf, center=center)
+    return TrainingSample(points=points, mask=mask, queries=queries, sdf=sdf)
 
 
 def _queries(
@@ -101,7 +79,7 @@ def _queries(
 
 
 def partial_cloud(
-    key: Array, views: Float[Array, "v n 3"], other: Array, config: TrainingConfig, count: int
+    key: Array, views: Float[Array, "v n 3"], other: Array, config: SampleConfig, count: int
 ) -> tuple[Cloud, Kept]:
     """A few views merged, noise, then cuts and junk; `count` points in farthest-point order."""
     keys = jax.random.split(key, 7)

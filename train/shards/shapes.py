@@ -1,4 +1,4 @@
-"""From a source mesh to what training needs of it: solid, depth views, signed distances (METHOD 2)."""
+"""From a source mesh to what training needs of it: solid, depth views, signed distances (paper §3.1)."""
 
 from __future__ import annotations
 

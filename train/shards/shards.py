@@ -11,9 +11,8 @@ import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jaxtyping import Float
@@ -21,7 +20,9 @@ from jaxtyping import Float
 from more2_jax.types import pytree
 from train.furniture.packed import read_packed, write_packed
 from train.furniture.source_mesh import SourceMesh
-from train.shards.shapes import Shape
+
+if TYPE_CHECKING:  # making shapes needs the extra `data`, training on them does not
+    from train.shards.shapes import Shape
 
 MAPPED = ("views", "sdf_uniform", "sdf_near")  # what samples are drawn from
 ARRAYS = (*MAPPED, "fingerprint")
@@ -111,20 +112,6 @@ def open_shards(folders: str | Path | Sequence[str | Path], split: str) -> Shard
             f"{', '.join(map(str, given))}: no {split} shapes; `python -m train.prepare` makes them"
         )
     return ShardView(shards=tuple(shards), rows=tuple(rows), meta=tuple(meta))
-
-
-def load_shapes(
-    folders: str | Path | Sequence[str | Path], split: str, queries: int = 16_000, most: int | None = None
-) -> Shapes:
-    """The shapes of a split in memory, with the first `queries` of each kind (their order is random already).
-
-    `most` keeps the first so many shapes. ValueError if there is none.
-    """
-    view = open_shards(folders, split)
-    kept = range(len(view) if most is None else min(most, len(view)))
-    cut = {"views": None, "sdf_uniform": queries, "sdf_near": queries}
-    rows = {name: np.stack([view[i][name][:count] for i in kept]) for name, count in cut.items()}
-    return Shapes(**{name: jnp.asarray(array) for name, array in rows.items()})
 
 
 def read_solids(shard: Path) -> list[SourceMesh]:

@@ -1,4 +1,4 @@
-"""Signed distances of closed solids: the queries that training asks for (METHOD 2)."""
+"""Signed distances of closed solids: the queries that training asks for (paper §3.1)."""
 
 from __future__ import annotations
 

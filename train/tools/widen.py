@@ -20,9 +20,10 @@ import numpy as np
 from flax.traverse_util import flatten_dict, unflatten_dict
 from jax import Array
 
-from more2_jax.config import DecoderConfig, PriorConfig, TrainingRun, load_config
+from more2_jax.config import DecoderConfig, PriorConfig, load_config
 from more2_jax.network.prior import Prior, init_prior, load_prior, save_prior
 from train.run.program import run
+from train.run.settings import TrainingRun
 
 Weights = dict[str, np.ndarray]
 Parts = Sequence[tuple[int, int]]  # widths, before and after, of what stands side by side in a matrix' rows

@@ -1,4 +1,4 @@
-"""The raw depth frames of a 3RScan sequence: `sequence/` or `sequence.zip` (METHOD 8).
+"""The raw depth frames of a 3RScan sequence: `sequence/` or `sequence.zip` (paper §4).
 
 `_info.txt` holds the pinhole intrinsics (row-major 4×4) and the units of depth in a meter; `frame-*.depth.pgm`
 is 16 bit, most significant byte first; `frame-*.pose.txt` is `T_world_camera`, row-major, meters. The camera
@@ -173,7 +173,7 @@ def back_project(
     T_world_camera: Float[np.ndarray, "4 4"],
     stride: int,
 ) -> Float[np.ndarray, "n 3"]:
-    """Points in the world of every `stride`-th pixel both ways that has a depth; row by row, meters (METHOD 8)."""
+    """Points in the world of every `stride`-th pixel both ways that has a depth; row by row, meters (paper §4)."""
     row, column = np.nonzero(depth[::stride, ::stride])
     row, column = row * stride, column * stride
     z = depth[row, column] / intrinsics.depth_shift

@@ -1,4 +1,4 @@
-"""3RScan (Wald et al. 2019; METHOD 8): a scan's folder, read from its annotated mesh or its raw depth frames.
+"""3RScan (Wald et al. 2019; paper §4): a scan's folder, read from its annotated mesh or its raw depth frames.
 
 `labels.instances.annotated.v2.ply` gives every vertex its `objectId` (0: none), `semseg.v2.json` the labels.
 The mesh's colors paint the instances (`ply_color` of 3DSSG's `objects.json`), in which the truth shows: never read.

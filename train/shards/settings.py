@@ -1,0 +1,39 @@
+"""Settings of training samples and of the losses on them; lengths in canonical units (longest edge 0.9)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class SampleConfig:
+    """What is drawn of a shape: two partial clouds with the flaws of real scans, and queries of known distance."""
+
+    queries: int = 1024  # a cloud: half uniform, half near the surface
+    raw_points: int = 2048  # before farthest-point sampling
+    max_views: int = 8
+    noise: float = 0.005
+    augment_probability: float = 0.6  # of a cloud to be open to the flaws below (as published)
+    one_view_probability: float = 0.2  # seen from one side; what follows are shares of the augmented clouds
+    crop_probability: float = 0.5  # a half-space cut off, as by a truncated mask
+    ball_probability: float = 0.5  # a ball removed, as by occlusion
+    junk_probability: float = 0.5  # a fragment of another object, or a patch of floor or wall, added
+    depth_noise_probability: float = 0.4  # the camera's: along the ray, quantized, with lost edges
+    depth_noise: float = 0.002  # standard deviation of inverse depth, 1 / canonical unit
+    depth_step: float = 0.002  # of inverse depth
+
+
+@dataclass(frozen=True)
+class LossConfig:
+    """Weights of the terms of the training loss, and what they are measured by."""
+
+    near_surface: float = 0.1  # |SDF| below it weighs 1, else 0.5
+    center_weight: float = 0.2
+    scale_weight: float = 0.01
+    contrast_weight: float = 0.05  # InfoNCE on F_inv between two partial clouds of one shape
+    contrast_temperature: float = 0.07
+    turn_weight: float = 0.5  # ‖F_eqv − F_eqv'‖² between them: same orientation in, same vectors out
+    rotation_weight: float = 0.0  # how far Kabsch's algorithm is from the identity between them
+    sign_weight: float = 0.0  # cross-entropy of inside and outside
+    sign_width: float = 0.01  # canonical units: where its sigmoid has half of its height
+    up_weight: float = 0.0  # the first third of F_eqv should point up
