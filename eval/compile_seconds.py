@@ -44,19 +44,19 @@ class Recorder:
         self.programs: defaultdict[str, Program] = defaultdict(Program)
         self._began: dict[tuple[int, str, str], float] = {}
 
-    def began(self, event: str, value: float | int, **about: str | int) -> None:
+    def began(self, event: str, value: float | int, **kwargs: str | int) -> None:
         """What JAX calls at the start of a step."""
         if event in STEPS:
-            self._began[threading.get_ident(), event, str(about["fun_name"])] = time.process_time()
+            self._began[threading.get_ident(), event, str(kwargs["fun_name"])] = time.process_time()
 
-    def ended(self, event: str, seconds: float, **about: str | int) -> None:
+    def ended(self, event: str, duration_secs: float, **kwargs: str | int) -> None:
         """What JAX calls at the end of a step."""
         if event not in STEPS:
             return
-        name, step = str(about["fun_name"]), STEPS[event]
+        name, step = str(kwargs["fun_name"]), STEPS[event]
         began = self._began.pop((threading.get_ident(), event, name))
         program = self.programs[name.removeprefix("jit(").removeprefix("jit_").removesuffix(")")]
-        program.wall[step] += seconds
+        program.wall[step] += duration_secs
         program.cpu[step] += time.process_time() - began
         program.compiled += step == "compile"
 
