@@ -31,17 +31,15 @@ def over_neighbors(
     `source` has a row a point to choose from, `own` a row a point, `shared` is the same for all, `each` has a
     leading axis of k. Returns the sum of the a and the stack (k, n, …) of the b; either may be empty.
     """
-    result: tuple[Tree, Tree] = _scan(edge, source, own, shared, each, index)  # pyright: ignore[reportAssignmentType]
-    return result
 
+    # Inside a scan nothing merges the second computation with the first: no barriers are needed to keep them apart.
+    @partial(jax.checkpoint, prevent_cse=False)
+    def computed_anew(source: Tree, own: Tree, shared: Tree, of_edge: Tree, j: Array) -> tuple[Tree, Tree]:
+        return edge(_rows(source, j), own, shared, of_edge)
 
-@partial(jax.custom_vjp, nondiff_argnums=(0,))
-def _scan(
-    edge: Edge, source: Tree, own: Tree, shared: Tree, each: Tree, index: Int[Array, "n k"]
-) -> tuple[Tree, Tree]:
     def step(total: Tree, at: tuple[Array, Tree]) -> tuple[Tree, Tree]:
         j, of_edge = at
-        summand, kept = edge(_rows(source, j), own, shared, of_edge)
+        summand, kept = computed_anew(source, own, shared, of_edge, j)
         return jax.tree.map(jnp.add, total, summand), kept
 
     shapes, _ = jax.eval_shape(
@@ -53,29 +51,3 @@ def _scan(
 
 def _rows(source: Tree, index: Int[Array, " n"]) -> Tree:
     return jax.tree.map(lambda x: x.at[index].get(mode=IN_BOUNDS), source)
-
-
-def _forward(
-    edge: Edge, source: Tree, own: Tree, shared: Tree, each: Tree, index: Array
-) -> tuple[tuple[Tree, Tree], tuple[Tree, ...]]:
-    return _scan(edge, source, own, shared, each, index), (source, own, shared, each, index)
-
-
-def _backward(edge: Edge, kept: tuple[Tree, ...], gradient: tuple[Tree, Tree]) -> tuple[Tree, ...]:
-    source, own, shared, each, index = kept
-    of_sum, of_stack = gradient
-
-    def step(total: Tree, at: tuple[Array, Tree, Tree]) -> tuple[Tree, Tree]:
-        j, of_edge, of_kept = at
-        _, pull = jax.vjp(edge, _rows(source, j), own, shared, of_edge)
-        d_rows, d_own, d_shared, d_each = pull((of_sum, of_kept))
-        d_source, *rest = total
-        d_source = jax.tree.map(lambda whole, rows: whole.at[j].add(rows, mode=IN_BOUNDS), d_source, d_rows)
-        return (d_source, *jax.tree.map(jnp.add, tuple(rest), (d_own, d_shared))), d_each
-
-    zero = jax.tree.map(jnp.zeros_like, (source, own, shared))
-    (d_source, d_own, d_shared), d_each = jax.lax.scan(step, zero, (index.T, each, of_stack))
-    return d_source, d_own, d_shared, d_each, None
-
-
-_scan.defvjp(_forward, _backward)
