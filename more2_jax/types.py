@@ -40,7 +40,6 @@ if not TYPE_CHECKING:  # where a checker must not believe that every name exists
     __getattr__ = names_of(__name__)
 
 
-
 def quantity(kind: Quantity, **options: Any) -> Any:
     """A field of a record that says how it changes when the record is moved or rescaled."""
     return flax.struct.field(metadata={"quantity": kind}, **options)
