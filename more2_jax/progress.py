@@ -8,17 +8,39 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Literal
 
+Unit = Literal["objects", "pairs"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Stage:
+    """A part of the work that is timed and told of."""
+
+    doing: str  # on the command line: "matching scan_1"
+    title: str  # on the page
+    unit: Unit = "objects"  # of what is counted
+
+
+# In the order of the work; scene.json has their seconds by these names.
+STAGES = {
+    "encode": Stage(doing="encoding", title="Describing each object"),
+    "match": Stage(doing="matching", title="Finding it again"),
+    "register": Stage(doing="registering", title="Finding how it moved", unit="pairs"),
+    "close": Stage(doing="fitting together", title="Fitting all scans of it together"),
+    "joint": Stage(doing="optimizing jointly", title="Refining shape and pose"),
+    "mesh": Stage(doing="meshing", title="Reconstructing surfaces"),
+}
+
 
 @dataclass(frozen=True, kw_only=True)
 class Progress:
     """One stage began, came further, or ended."""
 
     event: Literal["started", "advanced", "finished"]
-    stage: str  # encode, match, register, close, joint, mesh
+    stage: str  # one of `STAGES`
     scan: str | None  # name of the scan being added; None where the whole scene is worked on
     done: int
     total: int
-    unit: Literal["objects", "pairs"]  # of `done` and `total`
+    unit: Unit  # of `done` and `total`
     seconds: float  # since the stage began
 
 
@@ -33,7 +55,6 @@ def staged(
     total: int,
     *,
     scan: str | None = None,
-    unit: Literal["objects", "pairs"] = "objects",
 ) -> Iterator[Callable[[int], None]]:
     """Adds the seconds of a stage to `timing` and tells `progress`; yields a function that takes what is done.
 
@@ -46,7 +67,13 @@ def staged(
             seconds = time.perf_counter() - began
             progress(
                 Progress(
-                    event=event, stage=stage, scan=scan, done=done, total=total, unit=unit, seconds=seconds
+                    event=event,
+                    stage=stage,
+                    scan=scan,
+                    done=done,
+                    total=total,
+                    unit=STAGES[stage].unit,
+                    seconds=seconds,
                 )
             )
 

@@ -74,7 +74,7 @@ def add_scan(
         known = [o for o, _ in old]
         identified = identify(prior, known, new, config, rooms_of(scene, scan))
     found, chance = identified.found, {objects[k].id: p for k, p in identified.gone.items()}
-    with stage("register", len(found), unit="pairs"):
+    with stage("register", len(found)):
         seen, frame = relocalize(prior, objects, old, instances, new, identified, index, config)
     for f, observation in zip(found, seen, strict=True):
         objects[f.object] = seen_again(objects[f.object], instances[f.instance], observation)

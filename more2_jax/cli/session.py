@@ -26,17 +26,9 @@ from rich.progress import Progress as Bars
 from rich.table import Table
 
 from more2_jax.cli.options import Reporting
-from more2_jax.progress import Progress
+from more2_jax.progress import STAGES, Progress
 
 WIDTH = 120  # of lines where no terminal says how wide it is
-DOING = {
-    "encode": "encoding",
-    "match": "matching",
-    "register": "registering",
-    "close": "fitting together",
-    "joint": "optimizing jointly",
-    "mesh": "meshing",
-}
 
 
 def _console() -> Console:
@@ -101,7 +93,7 @@ class Session:
 
     def watch(self, p: Progress) -> None:
         """Takes what a stage tells: a bar on a terminal; elsewhere a line once the stage has ended."""
-        about = f"{DOING[p.stage]} {p.scan or 'the scene'}"
+        about = f"{STAGES[p.stage].doing} {p.scan or 'the scene'}"
         if self.console.is_terminal and not self.reporting.quiet:
             self._draw(p, about)
         if p.event == "finished":

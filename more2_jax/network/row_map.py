@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 from jax.sharding import Mesh, PartitionSpec
@@ -60,5 +61,13 @@ def chunked(function: Callable[[Tree], Tree], size: int, rows: Tree) -> Tree:
             part = jax.tree.map(lambda x, at=at: x[at], host)
             calls.append(function(part if len(devices) == 1 else jax.device_put(part, device)))
         for start, call in zip(starts, calls, strict=True):
-            found.append(jax.tree.map(lambda x, n=count - start: x[:n], jax.device_get(call)))
-    return jax.tree.map(lambda *x: np.concatenate(x), *found) if len(found) > 1 else found[0]
+            found.append(jax.tree.map(lambda x, n=count - start: x[:n], _on_host(call)))
+    if len(found) == 1:
+        return found[0]
+    traced = any(isinstance(x, Tracer) for x in jax.tree.leaves(found[0]))  # of weights, say
+    return jax.tree.map(lambda *x: (jnp if traced else np).concatenate(x), *found)
+
+
+def _on_host(tree: Tree) -> Tree:
+    """The arrays on the host, where they have values."""
+    return tree if any(isinstance(x, Tracer) for x in jax.tree.leaves(tree)) else jax.device_get(tree)

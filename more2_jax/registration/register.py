@@ -13,11 +13,14 @@ import jax
 
 from more2_jax.config import DescentRegistration, MotionModel, RegistrationMethod
 from more2_jax.network.prior import Prior, check_embedding
+from more2_jax.network.row_map import chunked
 from more2_jax.registration.descent import register_by_descent
 from more2_jax.registration.older_calls import accepts_clouds
 from more2_jax.registration.pair_batch import PairBatch
 from more2_jax.registration.surface import register_by_surfaces
 from more2_jax.types import Registration
+
+PAIRS_A_CALL = 8  # of descent; `register_by_surfaces` has its own
 
 
 @accepts_clouds
@@ -35,7 +38,8 @@ def register(
         check_embedding(prior, pairs.source.code, "register")
         check_embedding(prior, pairs.target.code, "register")
     if isinstance(method, DescentRegistration):
-        return _by_descent(prior, dataclasses.replace(pairs.local(), prepared=None), method)
+        pairs = dataclasses.replace(pairs.local(), prepared=None)
+        return chunked(partial(_by_descent, prior, method=method), PAIRS_A_CALL, pairs)
     return register_by_surfaces(prior, pairs.local(), method, motion)
 
 

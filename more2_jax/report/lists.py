@@ -7,18 +7,11 @@ from collections.abc import Iterable, Mapping, Sequence
 from html import escape
 from typing import Any
 
+from more2_jax.progress import STAGES
 from more2_jax.report.wording import STATES
 from more2_jax.types import LivingScene, ScanRecord
 
 WORDS = {"moved": "moved", "added": "added", "removed": "removed", "static": "stayed"}
-STAGES = {
-    "encode": "Describing each object",
-    "match": "Finding it again",
-    "register": "Finding how it moved",
-    "close": "Fitting all scans of it together",
-    "joint": "Refining shape and pose",
-    "mesh": "Reconstructing surfaces",
-}
 
 
 def object_list(objects: Sequence[Mapping[str, Any]], verdicts: Sequence[Mapping[str, Any]]) -> str:
@@ -88,7 +81,7 @@ def timing_table(timing_s: Mapping[str, float]) -> str:
     longest = max([*timing_s.values(), 1e-9])
     rows = [
         [
-            escape(STAGES.get(stage, stage)),
+            escape(STAGES[stage].title if stage in STAGES else stage),
             f'<span class="meter" style="width:{100 * seconds / longest:.1f}%"></span>',
             f"{seconds:.1f} s",
         ]

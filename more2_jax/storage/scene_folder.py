@@ -21,8 +21,10 @@ from typing import Any
 import numpy as np
 import yaml
 
-from more2_jax.config import SceneConfig, load_config, to_yaml
+from more2_jax.config import SceneConfig, to_yaml
+from more2_jax.progress import STAGES
 from more2_jax.storage.ply_files import read_mesh, read_points, write_mesh, write_points
+from more2_jax.storage.stored_settings import read_settings
 from more2_jax.types import (
     Anchors,
     Changes,
@@ -37,7 +39,6 @@ from more2_jax.types import (
 )
 
 VERSION = 1
-STAGES = ("encode", "match", "register", "close", "joint", "mesh")
 PAGE = "report.html"
 WRITTEN = (
     "scene.json",
@@ -266,7 +267,7 @@ def load_scene(folder: str | Path) -> tuple[LivingScene, SceneConfig]:
     try:
         content = json.loads((at / "scene.json").read_text(encoding="utf-8"))
         if (version := content["version"]) == VERSION:
-            return _scene(at, content), load_config(at / "config.yaml", SceneConfig)
+            return _scene(at, content), read_settings(at / "config.yaml")
     except DAMAGE as error:
         reason = " ".join(str(error).split())
         raise ValueError(f"{folder}: damaged living scene ({type(error).__name__}: {reason})") from error
