@@ -99,7 +99,8 @@ class EvidenceMatcher:
         0.5  # of |log| of the ratio of the F_s, against the cosine of the F_inv, in what is proposed
     )
     motion_weight: float = 0.2  # log odds that a meter moved costs: decides among identical objects
-    search: SurfaceSearch = field(default_factory=SurfaceSearch)
+    # Its evidence is calibrated on poses found without free space, which has its say when they are refined.
+    search: SurfaceSearch = SurfaceSearch(free_weight=0.0)
 
 
 @dataclass(frozen=True)
