@@ -38,12 +38,6 @@ class Surface:
     grid: NearestGrid | None = None  # names the nearest of `dense`; without it every distance is measured
 
 
-def surface(cloud: Sampled) -> Surface:
-    """The cloud with the normals of its sample and of all of it."""
-    normals_of = normal_estimator(cloud.dense, cloud.dense_mask)
-    return Surface(sampled=cloud, normals=normals_of(cloud.points), dense_normals=normals_of(cloud.dense))
-
-
 def whole_surface(points: Float[Array, "n 3"], mask: Bool[Array, " n"]) -> Surface:
     """A cloud that is its own sample; `thinned` and `coarsened` make of it what is compared."""
     normals = normal_estimator(points, mask)(points)

@@ -45,14 +45,6 @@ class PlacedMesh:
     T_room_model: Pose
 
 
-def upright_pose(yaw: float, x: float, y: float) -> Pose:
-    """Standing on the floor at (x, y), turned by `yaw` radians."""
-    pose = np.eye(4)
-    pose[:3, :3] = Rotation.from_euler("z", yaw).as_matrix()
-    pose[:2, 3] = x, y
-    return pose
-
-
 def footprint_radius(vertices: Float[np.ndarray, "v 3"]) -> float:
     """Radius about the model's origin that holds its footprint, meters."""
     return float(np.linalg.norm(vertices[:, :2], axis=1).max())
