@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.table import Table
 
 from eval.data.flyingshape import flyingshape
-from eval.peers.extra import has
+from eval.harness.extra import has
 from eval.peers.registration import many_starts
 from eval.registration import own_records, peer_records, true_pairs
 from eval.scores.figures import Record

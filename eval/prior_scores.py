@@ -32,7 +32,7 @@ from more2_jax.matching.code_assignment import hungarian, score_matrix
 from more2_jax.metrics import symmetry_aware_rotation_error_deg
 from more2_jax.network.prior import Prior, encode_ordered, field_sdf, load_prior, object_field
 from more2_jax.types import Embedding
-from train.rooms.ray_scanner import yaw_symmetry
+from train.furniture.symmetry import yaw_symmetry
 from train.run.program import run
 from train.shards.shards import ShardView, open_shards, read_solids, shard_folders
 

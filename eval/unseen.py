@@ -24,7 +24,7 @@ from more2_jax.scene import add_scan, start_scene
 from more2_jax.types import LivingScene
 from train.furniture.collections import SourceMesh, read_meshes
 from train.furniture.heldout import read_ikea
-from train.rooms.ray_scanner import yaw_symmetry
+from train.furniture.symmetry import yaw_symmetry
 from train.rooms.visits import FlyingConfig, FlyingScene, TrueObject, flying_scene
 from train.run.program import run
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
-from eval.peers.extra import library
+from eval.harness.extra import library
 from eval.scores.figures import Record, Row
 
 ENDINGS = ("png", "svg")

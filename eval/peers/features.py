@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from eval.peers.extra import library
+from eval.harness.extra import library
 from more2_jax.geometry.poses import Points
 
 VOXEL = 0.02  # of the diagonal

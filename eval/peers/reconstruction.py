@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial import KDTree
 
-from eval.peers.extra import library
+from eval.harness.extra import library
 from eval.peers.features import diagonal, open3d_cloud
 from more2_jax.geometry.poses import Points
 from more2_jax.types import Mesh

@@ -16,7 +16,7 @@ from jaxtyping import Float
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
-from eval.peers.extra import has, library
+from eval.harness.extra import has, library
 from eval.peers.features import VOXEL, Featured, diagonal, featured
 from more2_jax.geometry.poses import Points, Pose
 

@@ -5,8 +5,8 @@ import pytest
 import trimesh
 from known_scenes import pose
 
+from eval.harness.extra import has, library
 from eval.peers import matching, registration
-from eval.peers.extra import has, library
 from more2_jax.geometry.poses import rotation_error_deg
 from more2_jax.types import Instance
 

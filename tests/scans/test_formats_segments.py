@@ -132,7 +132,17 @@ def test_segments_of_another_mesh_are_refused(tmp_path):
 
 
 def test_labels_of_the_room_and_of_no_object_are_background():
-    for label in ("wall", "Floor", "ceiling", "door_frame", "Door-Frame", "window", "REMOVE", "unlabeled"):
+    for label in (
+        "wall",
+        "Floor",
+        "ceiling",
+        "door_frame",
+        "Door-Frame",
+        "window",
+        "REMOVE",
+        "unlabeled",
+        "unlabelled",
+    ):
         assert is_background(label), label
     assert not is_background(None)
     assert {normalized(label) for label in BACKGROUND_LABELS} == BACKGROUND_LABELS

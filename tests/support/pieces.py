@@ -8,7 +8,7 @@ from places import DATA
 from scipy.spatial.transform import Rotation
 
 from train.furniture.collections import SourceMesh, read_meshes, standing
-from train.rooms.ray_scanner import yaw_symmetry
+from train.furniture.symmetry import yaw_symmetry
 
 FURNITURE = DATA / "unseen_furniture.npz"
 

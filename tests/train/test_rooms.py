@@ -10,6 +10,7 @@ import trimesh
 from places import DATA
 
 from train.furniture.collections import read_meshes
+from train.furniture.symmetry import yaw_symmetry
 from train.rooms.ray_scanner import (
     PlacedMesh,
     SensorConfig,
@@ -17,7 +18,6 @@ from train.rooms.ray_scanner import (
     footprint_radius,
     free_spot,
     scan_room,
-    yaw_symmetry,
 )
 from train.rooms.visits import FlyingConfig, FlyingScene, TrueObject, arrange, flying_scene
 

@@ -17,7 +17,7 @@ from train.furniture.closed_solids import watertight
 from train.furniture.collections import SourceMesh, check_mesh, read_meshes, standing
 from train.furniture.heldout import read_ikea
 from train.furniture.sweethome3d import Z_UP
-from train.rooms.ray_scanner import yaw_symmetry
+from train.furniture.symmetry import yaw_symmetry
 
 VERSION = 1  # of how models are closed: another number makes them anew
 SMALLEST_M, LARGEST_M = 0.05, 5.0  # longest edge that furniture has

@@ -90,3 +90,24 @@ def equivalent_poses(T: Pose, T_ref_model: Pose, T_scan_model: Pose, symmetry: S
     in_model = T_ref_model[:3, :3].T @ T[:3, :3] @ T_scan_model[:3, :3]
     back = np.linalg.inv(T_scan_model)
     return [T_ref_model @ S @ back for S in symmetry.placements(in_model)]
+
+
+def yaw_symmetry(
+    vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], tolerance: float = 0.015, seed: int = 0
+) -> int:
+    """Order of the symmetry about the vertical: 1 none, 2, 4, or 0 for any angle; measured on the surface.
+
+    A turn counts when the 90th percentile of the distance between turned and unturned surface is below
+    `tolerance` of the diagonal.
+    """
+    mesh = trimesh.Trimesh(vertices, faces, process=False)
+    points = trimesh.sample.sample_surface(mesh, 8000, seed=seed)[0]
+    tree, diagonal = KDTree(points), np.linalg.norm(np.ptp(points, axis=0))
+
+    def same(degrees: float) -> bool:
+        turned = points @ Rotation.from_euler("z", degrees, degrees=True).as_matrix().T
+        return bool(np.quantile(tree.query(turned)[0], 0.9) < tolerance * diagonal)
+
+    if all(same(angle) for angle in (23.0, 51.0, 77.0)):
+        return 0
+    return 4 if same(90) else 2 if same(180) else 1

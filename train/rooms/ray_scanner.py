@@ -11,8 +11,6 @@ from dataclasses import dataclass
 import numpy as np
 import trimesh
 from jaxtyping import Bool, Float, Int
-from scipy.spatial import KDTree
-from scipy.spatial.transform import Rotation
 from trimesh.ray.ray_pyembree import RayMeshIntersector
 
 from more2_jax.geometry.poses import Pose
@@ -209,24 +207,3 @@ def in_field(
     x, y, z = (rays @ camera_axes(forward)).T
     half = np.tan(np.deg2rad(config.half_field_deg)) * z
     return (z > 0) & (np.abs(x) <= half) & (np.abs(y) <= half * config.height / config.width)
-
-
-def yaw_symmetry(
-    vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], tolerance: float = 0.015, seed: int = 0
-) -> int:
-    """Order of the symmetry about the vertical: 1 none, 2, 4, or 0 for any angle; measured on the surface.
-
-    A turn counts when the 90th percentile of the distance between turned and unturned surface is below
-    `tolerance` of the diagonal.
-    """
-    mesh = trimesh.Trimesh(vertices, faces, process=False)
-    points = trimesh.sample.sample_surface(mesh, 8000, seed=seed)[0]
-    tree, diagonal = KDTree(points), np.linalg.norm(np.ptp(points, axis=0))
-
-    def same(degrees: float) -> bool:
-        turned = points @ Rotation.from_euler("z", degrees, degrees=True).as_matrix().T
-        return bool(np.quantile(tree.query(turned)[0], 0.9) < tolerance * diagonal)
-
-    if all(same(angle) for angle in (23.0, 51.0, 77.0)):
-        return 0
-    return 4 if same(90) else 2 if same(180) else 1

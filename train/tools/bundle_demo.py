@@ -14,7 +14,8 @@ from plyfile import PlyData, PlyElement
 
 from train.furniture.closed_solids import canonical
 from train.furniture.sweethome3d import Furniture, read_catalog
-from train.rooms.ray_scanner import PlacedMesh, SensorConfig, scan_room, yaw_symmetry
+from train.furniture.symmetry import yaw_symmetry
+from train.rooms.ray_scanner import PlacedMesh, SensorConfig, scan_room
 from train.rooms.visits import arrange
 from train.run.program import run
 from train.shards.depth_views import depth_views

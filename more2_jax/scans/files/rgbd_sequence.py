@@ -16,7 +16,6 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int
 
-from more2_jax.cli.priors import count
 from more2_jax.scans.labeled_cloud import UNREADABLE, one_line
 
 INFO, DEPTH, POSE = "_info.txt", ".depth.pgm", ".pose.txt"

@@ -11,8 +11,7 @@ from pathlib import Path
 from more2_jax.scans.files.ply_cloud import read_ply
 from more2_jax.scans.formats import ply_scan
 from more2_jax.scans.labeled_cloud import LabeledCloud, ReadOptions
-from more2_jax.scans.segment_groups import instances_of, read_groups, read_segment_indices
-from more2_jax.scans.structural_labels import drop_background
+from more2_jax.scans.segment_groups import labeled_by_groups, read_groups, read_segment_indices
 
 MESH = "_vh_clean_2.ply"
 SEGMENTS = "_vh_clean_2.0.010000.segs.json"
@@ -42,16 +41,7 @@ def read(path: Path, options: ReadOptions) -> LabeledCloud:
     if any(group.id < 0 for group in groups):
         raise ValueError(f"{_beside(mesh, *AGGREGATIONS)}: a negative objectId; needed 0 or more")
     indices = read_segment_indices(_beside(mesh, SEGMENTS), len(cloud.points))
-    instance, labels, empty = instances_of(groups, indices, SHIFT)
-    instance, structural = drop_background(instance, labels)
-    return LabeledCloud(
-        points=cloud.points,
-        instance=instance,
-        colors=cloud.colors,
-        labels=labels,
-        skipped=(*structural, *empty),
-        unit="m",
-    )
+    return labeled_by_groups(cloud, groups, indices, SHIFT)
 
 
 def _annotated(mesh: Path) -> bool:
