@@ -12,7 +12,6 @@ import math
 import time
 from contextlib import nullcontext
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,8 +23,8 @@ from jax import Array
 from jax.sharding import Mesh
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
-from more2_jax.config import PriorConfig, load_config
-from more2_jax.network.prior import Prior, encode_ordered, init_prior, load_prior, save_prior
+from more2_jax.config import load_config
+from more2_jax.network.prior import Prior, save_prior
 from train.run.batches import Batches, batches_of
 from train.run.checkpoints import keep, open_checkpoints, resume
 from train.run.devices import agreed, connect, device_a_core, device_mesh, everywhere, here, is_first
@@ -34,14 +33,13 @@ from train.run.memory import keep_freed_memory, memory_bytes
 from train.run.pictures import held_out
 from train.run.program import run
 from train.run.settings import TrainingConfig, TrainingRun
-from train.run.shape_mix import ShapeMix, open_mix
+from train.run.shape_mix import open_mix
+from train.run.start import started_cold, started_warm
 from train.run.state import TrainingState, initial_state, training_step
 from train.run.validation import MOST_VALIDATED, total_score, validate
-from train.shards.sampling import sample_batch
 from train.shards.shards import Shapes
 
 IN_PICTURE = 6  # held-out shapes
-CALIBRATED = 32  # training shapes
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -125,42 +123,6 @@ def prepared(
         out=out,
         deadline=deadline,
     )
-
-
-def started_cold(settings: TrainingRun, train: ShapeMix, name: str) -> Prior:
-    """Random weights, F_s being about 1."""
-    model = calibrated(settings.model, settings.training, train)
-    return init_prior(model, jax.random.key(settings.training.seed), name)
-
-
-def started_warm(model: PriorConfig, weights: str, name: str) -> Prior:
-    """Weights that were trained before. Raises ValueError if they are not of this model."""
-    prior = load_prior(weights)
-    scale = prior.config.encoder.output_scale  # measured at the start of their training, and theirs for good
-    wanted = dataclasses.replace(model, encoder=dataclasses.replace(model.encoder, output_scale=scale))
-    if different := [
-        f
-        for f in ("encoder", "decoder", "eqv_gain", "inv_gain")
-        if getattr(wanted, f) != getattr(prior.config, f)
-    ]:
-        raise ValueError(
-            f"--warm-start {weights}: its {different[0]} is {getattr(prior.config, different[0])}; needed"
-            f" {getattr(wanted, different[0])}, as configured"
-        )
-    return dataclasses.replace(prior, name=name)
-
-
-def calibrated(model: PriorConfig, training: TrainingConfig, train: ShapeMix) -> PriorConfig:
-    """Chooses the encoder's output constant so that F_s ≈ 1 at step 0 on the training shapes (paper §3.1)."""
-    unit = dataclasses.replace(model, encoder=dataclasses.replace(model.encoder, output_scale=1.0))
-    prior = init_prior(unit, jax.random.key(training.seed))
-    shapes = train.read(np.linspace(0, len(train) - 1, min(CALIBRATED, len(train))).astype(int))
-    index = jnp.arange(len(shapes.views))
-    shapes = jax.tree.map(jnp.asarray, shapes)
-    sample = sample_batch(jax.random.key(training.seed), shapes, index, training, model.encoder.points)
-    scale = jax.jit(jax.vmap(partial(encode_ordered, prior)))(sample.points[:, 0], sample.mask[:, 0]).scale
-    constant = float(f"{1 / float(scale.mean()):.3g}")
-    return dataclasses.replace(model, encoder=dataclasses.replace(model.encoder, output_scale=constant))
 
 
 def averaged(setting: Setting, state: TrainingState) -> Prior:

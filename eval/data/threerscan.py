@@ -12,10 +12,10 @@ from pathlib import Path
 import numpy as np
 
 from eval.data.masks import associated
+from eval.data.threerscan_index import CATEGORIES, SYMMETRY_FOLDS, Place, Rescan, read_index
 from eval.data.truth import Benchmark, KnownObject, KnownScene
 from more2_jax.geometry.poses import apply_pose, rotation_error_deg
 from more2_jax.scans.read_scan import read_scan
-from more2_jax.scans.threerscan_index import CATEGORIES, SYMMETRY_FOLDS, Place, Rescan, read_index
 from more2_jax.storage.ply_files import read_mesh
 from more2_jax.types import Mesh, Scan
 from train.furniture.symmetry import SymmetryGroup

@@ -26,11 +26,11 @@ from eval.peers.matching import Matched, Matcher, assigned
 from more2_jax.config import PriorConfig, load_config
 from more2_jax.network.prior import Prior, encode_ordered, load_prior, save_prior
 from more2_jax.types import Instance
-from train.prior import started_cold
 from train.run.program import run
 from train.run.schedule import learning_rate
 from train.run.settings import TrainingConfig, TrainingRun
 from train.run.shape_mix import load_mix, open_mix
+from train.run.start import started_cold
 from train.shards.sampling import TrainingSample
 from train.shards.shards import open_shards
 

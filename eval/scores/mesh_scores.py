@@ -42,7 +42,6 @@ SHARES: tuple[str, ...] = (
     "recall.strict",
     "watertight",
 )
-KEYS = DISTANCES + SHARES
 
 
 def no_mesh() -> Scores:

@@ -14,6 +14,9 @@ import numpy as np
 from jaxtyping import Int
 
 from more2_jax.scans.files.json_file import read_json
+from more2_jax.scans.files.ply_cloud import PlyCloud
+from more2_jax.scans.labeled_cloud import LabeledCloud
+from more2_jax.scans.structural_labels import drop_background
 from more2_jax.types import Skipped
 
 ID_KEYS = ("objectId", "id")
@@ -119,6 +122,22 @@ def instances_of(
         for i in empty
     )
     return instance, labels, skipped
+
+
+def labeled_by_groups(
+    cloud: PlyCloud, groups: tuple[SegmentGroup, ...], indices: Int[np.ndarray, "n"], shift: int
+) -> LabeledCloud:
+    """The vertices, each in the instance that its segment belongs to; walls, floors and the like are background."""
+    instance, labels, empty = instances_of(groups, indices, shift)
+    instance, structural = drop_background(instance, labels)
+    return LabeledCloud(
+        points=cloud.points,
+        instance=instance,
+        colors=cloud.colors,
+        labels=labels,
+        skipped=(*structural, *empty),
+        unit="m",
+    )
 
 
 def shift_of(ids: list[int]) -> int:

@@ -19,7 +19,7 @@ STRUCTURE = frozenset(
     )
 )
 NOT_OBJECTS = frozenset(
-    ("unlabeled", "unlabeled", "unannotated", "undefined", "unknown", "void", "none", "remove", "split", "")
+    ("unlabeled", "unlabelled", "unannotated", "undefined", "unknown", "void", "none", "remove", "split", "")
 )
 BACKGROUND_LABELS = STRUCTURE | NOT_OBJECTS
 

@@ -14,9 +14,9 @@ from more2_jax.geometry.point_to_plane import (
     pose_covariance,
     sliding,
     solve_spd,
-    surface,
+    whole_surface,
 )
-from more2_jax.geometry.points import sample, transformed
+from more2_jax.geometry.points import transformed
 from more2_jax.registration.surface import choose, competing, misfit
 
 POINTS = 256
@@ -32,7 +32,7 @@ def box_points(rng, size=(1.0, 0.6, 0.4), count=POINTS):
 
 def as_surface(points, mask=None):
     mask = np.ones(len(points), bool) if mask is None else mask
-    return surface(sample(jnp.asarray(points, jnp.float32), jnp.asarray(mask), len(points), dense=True))
+    return whole_surface(jnp.asarray(points, jnp.float32), jnp.asarray(mask))
 
 
 aligned = jax.jit(align, static_argnames=("reach", "steps", "upright"))

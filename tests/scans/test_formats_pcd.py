@@ -7,7 +7,6 @@ import pytest
 from dataset_writers.masks import write_masks
 from dataset_writers.pcd import lzf, write_pcd
 
-from more2_jax.scans.files.lzf import decompress
 from more2_jax.scans.formats import pcd
 from more2_jax.scans.labeled_cloud import ReadOptions
 from more2_jax.scans.read_scan import read_scan
@@ -89,12 +88,15 @@ def test_no_masks_are_said_or_welcome(tmp_path: Path):
 
 @pytest.mark.parametrize("plain", [b"", b"a", b"a" * 1000, b"abc" * 200, bytes(range(256)) * 50])
 def test_lzf_round_trip(plain: bytes):
-    assert decompress(lzf(plain), len(plain)) == plain
+    assert pcd.decompressed(lzf(plain), len(plain)) == plain
+    for size in (len(plain) - 1, len(plain) + 1):
+        with pytest.raises(ValueError, match="yield"):
+            pcd.decompressed(lzf(plain), size)
 
 
 def test_lzf_promises_more_than_it_can_hold():
     with pytest.raises(ValueError, match="cannot yield"):
-        decompress(b"\x00a", 10**12)
+        pcd.decompressed(b"\x00a", 10**12)
 
 
 @pytest.mark.parametrize("data", ENCODINGS)

@@ -82,7 +82,7 @@ def test_shards_resume_and_repeat(folder: Path, tmp_path: Path, monkeypatch: pyt
     assert same_files(second, tmp_path / "second")
     assert not list(out.glob("*.partial"))
     names = {m["name"] for path in (first, second) for m in read_meta(path)}
-    assert names == {"box.ply", "ball.ply", procedural_meshes_name()}
+    assert names == {"box.ply", "ball.ply", procedural_name()}
     rejected = json.loads((out / "report.json").read_text())["rejected"]
     assert list(rejected) == ["needle.ply"]
     assert "flat" in rejected["needle.ply"]
@@ -90,7 +90,7 @@ def test_shards_resume_and_repeat(folder: Path, tmp_path: Path, monkeypatch: pyt
         prepare.main(out, (folder,), procedural=2, workers=1)
 
 
-def procedural_meshes_name() -> str:
+def procedural_name() -> str:
     return next(iter(prepare.procedural_recipes(1))).name
 
 

@@ -18,7 +18,6 @@ from train.rooms.ray_scanner import (
     footprint_radius,
     free_spot,
     scan_room,
-    upright_pose,
 )
 from train.rooms.visits import FlyingConfig, FlyingScene, TrueObject, arrange, flying_scene
 
@@ -154,11 +153,12 @@ def test_arranging_keeps_static_objects_and_bounds_how_far_others_go():
 
 
 def placed(extents: tuple[float, float, float], x: float, y: float) -> PlacedMesh:
+    pose = np.eye(4)
+    pose[:2, :2] = [[np.cos(0.3), -np.sin(0.3)], [np.sin(0.3), np.cos(0.3)]]
+    pose[:2, 3] = x, y
     box = trimesh.creation.box(extents)
     vertices = np.asarray(box.vertices) + np.array([0, 0, extents[2] / 2])
-    return PlacedMesh(
-        model="box", vertices=vertices, faces=np.asarray(box.faces), T_room_model=upright_pose(0.3, x, y)
-    )
+    return PlacedMesh(model="box", vertices=vertices, faces=np.asarray(box.faces), T_room_model=pose)
 
 
 def test_an_enclosed_object_is_never_seen():

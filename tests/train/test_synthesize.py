@@ -19,7 +19,7 @@ from train.furniture.closed_models import closed_model, make_cached, read_models
 from train.furniture.collections import SourceMesh, write_packed
 from train.rooms.cameras import SPARSE
 from train.rooms.regimes import REGIMES, balanced, by_category, furniture, near_twin, scene_config
-from train.rooms.scene_files import GRID_M, read_benchmark, read_scene
+from train.rooms.scene_files import GRID_M, read_scene
 from train.rooms.visits import FlyingScene, TrueObject, surface_samples
 
 
@@ -229,7 +229,8 @@ def test_any_number_of_workers_gives_the_same_and_a_stopped_run_resumes(source, 
     assert command(source, tmp_path / "one", "--workers", "1").returncode == 0
     assert json.loads((tmp_path / "one" / "index.json").read_text()) == index
     assert kept.stat().st_mtime_ns == before
-    assert [s.name for s in read_benchmark(tmp_path / "one")] == ["scene_0000", "scene_0001"]
+    index_names = ["scene_0000", "scene_0001"]
+    assert [read_scene(tmp_path / "one" / n).name for n in index_names] == index_names
     assert "License: CC0" in (tmp_path / "one" / "LICENSES.md").read_text()
     other = command(source, tmp_path / "one", "--seed", "1")
     assert (other.returncode, other.stderr.count("\n")) == (2, 1)

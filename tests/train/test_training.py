@@ -16,12 +16,12 @@ from places import ROOT
 from sphere_shards import sphere_shards
 
 from more2_jax.config import load_config
-from train.prior import started_warm
 from train.run.journal import Journal, read_log
 from train.run.pictures import EYE, splat
 from train.run.schedule import learning_rate
 from train.run.settings import TrainingRun
 from train.run.shape_mix import load_mix
+from train.run.start import started_warm
 from train.shards.losses import (
     LEAST_CORRELATION,
     contrast_loss,

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 import numpy as np
 import trimesh
 from jaxtyping import Bool, Float, Int
-from scipy.spatial.transform import Rotation
 from trimesh.ray.ray_pyembree import RayMeshIntersector
 
 from more2_jax.geometry.poses import Pose
@@ -42,14 +41,6 @@ class PlacedMesh:
     vertices: Float[np.ndarray, "v 3"]
     faces: Int[np.ndarray, "f 3"]
     T_room_model: Pose
-
-
-def upright_pose(yaw: float, x: float, y: float) -> Pose:
-    """Standing on the floor at (x, y), turned by `yaw` radians."""
-    pose = np.eye(4)
-    pose[:3, :3] = Rotation.from_euler("z", yaw).as_matrix()
-    pose[:2, 3] = x, y
-    return pose
 
 
 def footprint_radius(vertices: Float[np.ndarray, "v 3"]) -> float:

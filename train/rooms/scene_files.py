@@ -11,7 +11,7 @@ import hashlib
 import json
 import re
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -125,17 +125,6 @@ def scene_truth(scene: FlyingScene, facts: Mapping[str, Any], files: Mapping[str
     ]
     head = {"version": VERSION, "unit": "m", "name": scene.name, "regime": scene.regime}
     return {**head, **facts, "scans": scans, "objects": objects}
-
-
-def read_benchmark(folder: str | Path) -> Iterator[FlyingScene]:
-    """The scenes of a benchmark in order, with all that is true of them. Raises ValueError if it is none."""
-    folders = sorted(
-        p.parent for p in Path(folder).glob("scene_*/scene.json") if p.parent.suffix != ".partial"
-    )
-    if not folders:
-        raise ValueError(f"{folder}: no scene_*/scene.json; needed a benchmark that train.synthesize wrote")
-    for scene in folders:
-        yield read_scene(scene)
 
 
 def read_scene(folder: str | Path) -> FlyingScene:

@@ -59,7 +59,7 @@ class TrueObject:
     T_scan_model: dict[int, Pose]
     role: Role = "moved"
     seen: dict[int, Bool[np.ndarray, " samples"]] = field(default_factory=dict)  # of `surface_samples`
-    symmetry_order: int | None = None  # about the vertical, see `yaw_symmetry`; None: not measured
+    symmetry_order: int | None = None  # about the vertical, see `symmetry.yaw_symmetry`; None: not measured
     license: str = "unknown"
     source: str = ""
 

@@ -7,14 +7,15 @@ import struct
 from dataclasses import dataclass
 from pathlib import Path
 
+import lzf
 import numpy as np
 from jaxtyping import Int
 
-from more2_jax.scans.files.lzf import decompress
 from more2_jax.scans.files.ply_cloud import INSTANCE_PROPERTIES
 from more2_jax.scans.labeled_cloud import LabeledCloud, ReadOptions
 
 LONGEST_HEADER = 65_536  # bytes
+LONGEST_REFERENCE = 264  # bytes that three bytes of LZF, a reference back, can yield
 LARGEST_EXACT = 2**53  # whole numbers that a text's float64 holds exactly
 COLORS = ("rgb", "rgba")
 KINDS = {"F": "f", "I": "i", "U": "u"}
@@ -218,7 +219,7 @@ def _compressed(header: Header, body: memoryview) -> dict[str, np.ndarray]:
         raise ValueError(f"{size} bytes of points; needed {sum(header.widths) * header.points}")
     if packed > len(body) - 8:
         raise ValueError(f"{len(body) - 8} compressed bytes; needed {packed}")
-    content = decompress(bytes(body[8 : 8 + packed]), size)
+    content = decompressed(bytes(body[8 : 8 + packed]), size)
     columns, at = {}, 0
     for name, kind, count, bytes_ in zip(
         header.names, header.types, header.counts, header.widths, strict=True
@@ -227,6 +228,21 @@ def _compressed(header: Header, body: memoryview) -> dict[str, np.ndarray]:
             columns[name] = np.frombuffer(content, kind, header.points, at)
         at += bytes_ * header.points
     return columns
+
+
+def decompressed(packed: bytes, size: int) -> bytes:
+    """The `size` bytes that `packed` (LZF) stands for. ValueError if it yields another number or is damaged.
+
+    What it could yield at most is held against `size` before anything is allocated.
+    """
+    if size > len(packed) * LONGEST_REFERENCE:
+        raise ValueError(f"{len(packed)} compressed bytes cannot yield {size}")
+    content = lzf.decompress(packed, size) if packed else b""
+    if content is None or len(content) != size:
+        raise ValueError(
+            f"compressed bytes yield {'more' if content is None else len(content)}; needed {size}"
+        )
+    return content
 
 
 def _ascii(header: Header, body: memoryview) -> dict[str, np.ndarray]:

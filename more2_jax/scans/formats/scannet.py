@@ -1,21 +1,17 @@
 """ScanNet (Dai et al. 2017): `<scene>_vh_clean_2.ply` with its segments and their aggregation beside it.
 
 `objectId` counts from 0, so instance i here is object i - 1 there. Points are in the mesh's own frame, z up;
-`axis_alignment` gives the turn to the frame of the benchmark.
+the benchmark's `axisAlignment` is not applied.
 """
 
 from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
-from jaxtyping import Float
-
 from more2_jax.scans.files.ply_cloud import read_ply
 from more2_jax.scans.formats import ply_scan
-from more2_jax.scans.labeled_cloud import LabeledCloud, ReadOptions, one_line
-from more2_jax.scans.segment_groups import instances_of, read_groups, read_segment_indices
-from more2_jax.scans.structural_labels import drop_background
+from more2_jax.scans.labeled_cloud import LabeledCloud, ReadOptions
+from more2_jax.scans.segment_groups import labeled_by_groups, read_groups, read_segment_indices
 
 MESH = "_vh_clean_2.ply"
 SEGMENTS = "_vh_clean_2.0.010000.segs.json"
@@ -45,42 +41,7 @@ def read(path: Path, options: ReadOptions) -> LabeledCloud:
     if any(group.id < 0 for group in groups):
         raise ValueError(f"{_beside(mesh, *AGGREGATIONS)}: a negative objectId; needed 0 or more")
     indices = read_segment_indices(_beside(mesh, SEGMENTS), len(cloud.points))
-    instance, labels, empty = instances_of(groups, indices, SHIFT)
-    instance, structural = drop_background(instance, labels)
-    return LabeledCloud(
-        points=cloud.points,
-        instance=instance,
-        colors=cloud.colors,
-        labels=labels,
-        skipped=(*structural, *empty),
-        unit="m",
-    )
-
-
-def axis_alignment(path: Path) -> Float[np.ndarray, "4 4"]:
-    """`T_aligned_mesh` of a scene (its folder or mesh) from `<scene>.txt`: 16 numbers, row-major, meters."""
-    info = _beside(_mesh(path), ".txt")
-    try:
-        text = info.read_text(encoding="utf-8", errors="replace")
-    except OSError as error:
-        raise ValueError(f"{info}: not readable ({one_line(error)})") from error
-    for line in text.splitlines():
-        name, _, value = line.partition("=")
-        if name.strip() == "axisAlignment":
-            return _matrix(info, value)
-    raise ValueError(f"{info}: no line axisAlignment; needed 16 numbers, row-major")
-
-
-def _matrix(info: Path, text: str) -> Float[np.ndarray, "4 4"]:
-    try:
-        numbers = np.array([float(word) for word in text.split()])
-    except ValueError as error:
-        raise ValueError(f"{info}: axisAlignment is not numbers; needed 16, row-major") from error
-    if numbers.shape != (16,) or not np.isfinite(numbers).all():
-        raise ValueError(
-            f"{info}: axisAlignment has {numbers.size} numbers; needed 16 finite ones, row-major"
-        )
-    return numbers.reshape(4, 4)
+    return labeled_by_groups(cloud, groups, indices, SHIFT)
 
 
 def _annotated(mesh: Path) -> bool:

@@ -5,12 +5,12 @@ Points are in the frame of the aligned mesh, z up, meters.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 from more2_jax.scans.files.ply_cloud import read_ply
 from more2_jax.scans.labeled_cloud import LabeledCloud, ReadOptions
-from more2_jax.scans.segment_groups import instances_of, read_groups, read_segment_indices, shift_of
-from more2_jax.scans.structural_labels import drop_background
+from more2_jax.scans.segment_groups import labeled_by_groups, read_groups, read_segment_indices, shift_of
 
 MESH, SEGMENTS, ANNOTATION = "mesh_aligned_0.05.ply", "segments.json", "segments_anno.json"
 
@@ -39,17 +39,8 @@ def read(path: Path, options: ReadOptions) -> LabeledCloud:
         shift = shift_of([group.id for group in groups])
     except ValueError as error:
         raise ValueError(f"{annotation}: {error}") from error
-    instance, labels, empty = instances_of(groups, indices, shift)
-    instance, structural = drop_background(instance, labels)
-    return LabeledCloud(
-        points=cloud.points,
-        instance=instance,
-        colors=cloud.colors,
-        labels=labels,
-        skipped=(*structural, *empty),
-        unit="m",
-        warnings=(f"{ANNOTATION} counts objects from 0: instance i is object i - 1",) if shift else (),
-    )
+    said = (f"{ANNOTATION} counts objects from 0: instance i is object i - 1",) if shift else ()
+    return replace(labeled_by_groups(cloud, groups, indices, shift), warnings=said)
 
 
 def _candidates(path: Path) -> tuple[Path, ...]:

@@ -2,7 +2,7 @@
 
 `labels.instances.annotated.v2.ply` gives every vertex its `objectId` (0: none), `semseg.v2.json` the labels.
 The mesh's colors paint the instances (`ply_color` of 3DSSG's `objects.json`), in which the truth shows: never read.
-Points are in the scan's own frame, z up, meters; `more2_jax.scans.threerscan_index` has the poses between scans.
+Points are in the scan's own frame, z up, meters; `eval.data.threerscan_index` has the poses between scans.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Small true files of every format, for eval/fuzz_readers.py: `PYTHONPATH=tests python -m dataset_writers DIR`."""
+"""Small true files of every format, to be damaged: `PYTHONPATH=tests/support python -m dataset_writers DIR`."""
 
 import json
 import sys

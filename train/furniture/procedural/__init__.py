@@ -7,8 +7,7 @@ from train.furniture.procedural.furniture import (
     CATEGORIES,
     Recipe,
     procedural_mesh,
-    procedural_meshes,
     procedural_recipes,
 )
 
-__all__ = ["CATEGORIES", "Recipe", "procedural_mesh", "procedural_meshes", "procedural_recipes"]
+__all__ = ["CATEGORIES", "Recipe", "procedural_mesh", "procedural_recipes"]

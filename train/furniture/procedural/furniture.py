@@ -6,7 +6,7 @@ that reach into each other.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -78,12 +78,6 @@ def procedural_recipes(count: int, first: int = 0) -> list[Recipe]:
     return [
         Recipe(categories[k % len(categories)], k // len(categories)) for k in range(first, first + count)
     ]
-
-
-def procedural_meshes(count: int, first: int = 0) -> Iterator[SourceMesh]:
-    """The pieces of `procedural_recipes`, made one after the other."""
-    recipes = procedural_recipes(count, first)
-    return (recipe.mesh() for recipe in recipes)
 
 
 def procedural_mesh(category: str, seed: int) -> SourceMesh:

@@ -132,12 +132,6 @@ def slab(outline: Outline, thickness: float, at: Point = (0, 0, 0), bevel: float
     return kernel().Manifold.hull_points(np.concatenate(points) + at)
 
 
-def loft(sections: Sequence[Float[np.ndarray, "n 3"]]) -> Manifold:
-    """A solid through convex sections in order: the union of the hulls of neighbors."""
-    hull = kernel().Manifold.hull_points
-    return union([hull(np.concatenate(pair)) for pair in itertools.pairwise(sections)])
-
-
 def sheared(solid: Manifold, lean: float, above: float) -> Manifold:
     """Leans backwards (toward +y) by `lean` meters a meter above the height `above`."""
     return solid.transform(np.array([[1, 0, 0, 0], [0, 1, lean, -lean * above], [0, 0, 1, 0]], float))

@@ -7,7 +7,7 @@ import pytest
 from dataset_writers.threerscan import column_major
 from scipy.spatial.transform import Rotation
 
-from more2_jax.scans.threerscan_index import CATEGORIES, read_index
+from eval.data.threerscan_index import CATEGORIES, read_index
 
 
 def pose(turn_deg, shift):

@@ -1,0 +1,54 @@
+"""The weights a run begins with: random ones whose scale is right at step 0, or trained ones."""
+
+from __future__ import annotations
+
+import dataclasses
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from more2_jax.config import PriorConfig
+from more2_jax.network.prior import Prior, encode_ordered, init_prior, load_prior
+from train.run.settings import TrainingConfig, TrainingRun
+from train.run.shape_mix import ShapeMix
+from train.shards.sampling import sample_batch
+
+CALIBRATED = 32  # training shapes, by which the encoder's output constant is chosen
+
+
+def started_cold(settings: TrainingRun, train: ShapeMix, name: str) -> Prior:
+    """Random weights, F_s being about 1."""
+    model = calibrated(settings.model, settings.training, train)
+    return init_prior(model, jax.random.key(settings.training.seed), name)
+
+
+def started_warm(model: PriorConfig, weights: str, name: str) -> Prior:
+    """Weights that were trained before. Raises ValueError if they are not of this model."""
+    prior = load_prior(weights)
+    scale = prior.config.encoder.output_scale  # measured at the start of their training, and theirs for good
+    wanted = dataclasses.replace(model, encoder=dataclasses.replace(model.encoder, output_scale=scale))
+    if different := [
+        f
+        for f in ("encoder", "decoder", "eqv_gain", "inv_gain")
+        if getattr(wanted, f) != getattr(prior.config, f)
+    ]:
+        raise ValueError(
+            f"--warm-start {weights}: its {different[0]} is {getattr(prior.config, different[0])}; needed"
+            f" {getattr(wanted, different[0])}, as configured"
+        )
+    return dataclasses.replace(prior, name=name)
+
+
+def calibrated(model: PriorConfig, training: TrainingConfig, train: ShapeMix) -> PriorConfig:
+    """Chooses the encoder's output constant so that F_s ≈ 1 at step 0 on the training shapes (paper §3.1)."""
+    unit = dataclasses.replace(model, encoder=dataclasses.replace(model.encoder, output_scale=1.0))
+    prior = init_prior(unit, jax.random.key(training.seed))
+    shapes = train.read(np.linspace(0, len(train) - 1, min(CALIBRATED, len(train))).astype(int))
+    index = jnp.arange(len(shapes.views))
+    shapes = jax.tree.map(jnp.asarray, shapes)
+    sample = sample_batch(jax.random.key(training.seed), shapes, index, training, model.encoder.points)
+    scale = jax.jit(jax.vmap(partial(encode_ordered, prior)))(sample.points[:, 0], sample.mask[:, 0]).scale
+    constant = float(f"{1 / float(scale.mean()):.3g}")
+    return dataclasses.replace(model, encoder=dataclasses.replace(model.encoder, output_scale=constant))
