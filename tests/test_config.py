@@ -5,7 +5,19 @@ import dataclasses
 import pytest
 from places import ROOT
 
-from more2_jax.config import MatchingConfig, PriorConfig, SceneConfig, from_dict, load_config, preset, to_yaml
+from more2_jax.config import (
+    CodeMatcher,
+    DescentRegistration,
+    EvidenceMatcher,
+    PriorConfig,
+    SceneConfig,
+    SurfaceRegistration,
+    SurfaceSearch,
+    from_dict,
+    load_config,
+    preset,
+    to_yaml,
+)
 from train.run.settings import TrainingRun
 
 
@@ -29,12 +41,18 @@ def test_presets_round_trip(name, upright, tmp_path):
 
 def test_paper_is_the_paper():
     paper = preset("paper")
-    assert paper.matching == MatchingConfig(score="both", assignment="hungarian")
-    assert paper.registration.starts == "embedding"
-    assert (paper.registration.steps, paper.registration.trim) == (200, 1.0)
+    assert paper.matching == CodeMatcher(score="both", assignment="hungarian")
+    assert paper.registration == DescentRegistration(steps=200, trim=1.0)
     assert (paper.joint.start, paper.joint.steps) == ("best", 200)
-    assert paper.matching.motion_weight == 0 and not paper.matching.verify
     assert not paper.accumulate_target
+
+
+def test_robust_searches_alike_in_matching_and_registration():
+    robust = preset("robust")
+    assert isinstance(robust.matching, EvidenceMatcher) and isinstance(
+        robust.registration, SurfaceRegistration
+    )
+    assert robust.matching.search == robust.registration.search
 
 
 def test_base_has_the_published_widths():
@@ -47,9 +65,10 @@ def test_base_has_the_published_widths():
             assert getattr(getattr(model, part), name) == getattr(getattr(published, part), name), name
 
 
-def test_yaw_starts_only_when_upright():
-    assert preset("robust").registration.yaw_starts == 0
-    assert preset("robust", upright=True).registration.yaw_starts > 0
+@pytest.mark.parametrize("name", ["paper", "robust"])
+def test_motion_says_how_objects_may_move(name):
+    assert preset(name).motion == "free"
+    assert preset(name, upright=True).motion == "upright"
 
 
 def test_unknown_preset_names_the_known():
@@ -78,7 +97,38 @@ def test_wrong_values_are_named(values, complaint):
 
 def test_choices_are_listed():
     with pytest.raises(ValueError, match="score: got 'all', needed one of 'inv', 'eqv', 'both'"):
-        from_dict(MatchingConfig, {"score": "all"})
+        from_dict(CodeMatcher, {"score": "all"})
+
+
+def test_each_algorithm_has_settings_of_its_own_chosen_by_its_name():
+    values = {
+        "matching": {"method": "evidence", "search": {"keep": 3}},
+        "registration": {"method": "descent", "steps": 7},
+    }
+    config = from_dict(SceneConfig, values)
+    assert config.matching == EvidenceMatcher(search=SurfaceSearch(keep=3))
+    assert config.registration == DescentRegistration(steps=7)
+
+
+@pytest.mark.parametrize(
+    ("values", "complaint"),
+    [
+        ({"matching": {"method": "codes", "search": {}}}, "matching: unknown search; known are"),
+        ({"matching": {"score": "inv"}}, "matching.method: got None, needed one of 'codes', 'evidence'"),
+        (
+            {"registration": {"method": "icp"}},
+            "registration.method: got 'icp', needed one of 'descent', 'surface'",
+        ),
+        ({"registration": 3}, "registration.method: got 3, needed one of"),
+        (
+            {"registration": {"method": "surface", "search": {"turn": 3}}},
+            "registration.search: unknown turn; known are",
+        ),
+    ],
+)
+def test_settings_of_another_algorithm_or_of_none_are_named(values, complaint):
+    with pytest.raises(ValueError, match=complaint):
+        from_dict(SceneConfig, values)
 
 
 def test_whole_numbers_are_floats_and_missing_keys_keep_their_defaults():

@@ -5,6 +5,7 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 import jaxlie
+import numpy as np
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
@@ -48,10 +49,10 @@ class Sampled:
     """A cloud as a farthest-point sample (`points`) and in full (`dense`): sparse points are compared with the
     other's dense ones, so that a residual measures misfit and not the spacing of the samples."""
 
-    points: Float[Array, "*b n 3"] = quantity("position")
-    mask: Bool[Array, "*b n"] = quantity("invariant")
-    dense: Float[Array, "*b m 3"] = quantity("position")
-    dense_mask: Bool[Array, "*b m"] = quantity("invariant")
+    points: Float[Array | np.ndarray, "*b n 3"] = quantity("position")
+    mask: Bool[Array | np.ndarray, "*b n"] = quantity("invariant")
+    dense: Float[Array | np.ndarray, "*b m 3"] = quantity("position")
+    dense_mask: Bool[Array | np.ndarray, "*b m"] = quantity("invariant")
 
 
 def sample(points: Float[Array, "n 3"], mask: Bool[Array, " n"], count: int) -> Sampled:

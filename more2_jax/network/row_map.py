@@ -6,7 +6,6 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 from jax.sharding import Mesh, PartitionSpec
@@ -42,11 +41,11 @@ def chunked(function: Callable[[Tree], Tree], size: int, rows: Tree) -> Tree:
     """`function` of `rows` (leading axis b), in calls of `size` rows each: one compiled program whatever b is.
 
     Accelerators take `WIDER` times as many; several local devices take calls in turn, side by side. The last call is
-    filled up with its first row. Traced rows, whose number is part of a larger program anyway, go in one call.
-    Results are host arrays, but for traced rows.
+    filled up with its first row. Where anything is traced, the number of rows is part of a larger program anyway: they
+    go in one call. Results are host arrays, but for traced ones.
     """
     leaves = jax.tree.leaves(rows)
-    if any(isinstance(x, Tracer) for x in leaves):
+    if traced(rows):
         return function(rows)
     size = size if jax.default_backend() == "cpu" else WIDER * size
     count, devices = len(leaves[0]), jax.local_devices()
@@ -60,14 +59,13 @@ def chunked(function: Callable[[Tree], Tree], size: int, rows: Tree) -> Tree:
             )
             part = jax.tree.map(lambda x, at=at: x[at], host)
             calls.append(function(part if len(devices) == 1 else jax.device_put(part, device)))
+            if traced(calls[-1]):  # by what the function closes over, or as part of a larger program
+                return function(rows)
         for start, call in zip(starts, calls, strict=True):
-            found.append(jax.tree.map(lambda x, n=count - start: x[:n], _on_host(call)))
-    if len(found) == 1:
-        return found[0]
-    traced = any(isinstance(x, Tracer) for x in jax.tree.leaves(found[0]))  # of weights, say
-    return jax.tree.map(lambda *x: (jnp if traced else np).concatenate(x), *found)
+            found.append(jax.tree.map(lambda x, n=count - start: x[:n], jax.device_get(call)))
+    return jax.tree.map(lambda *x: np.concatenate(x), *found) if len(found) > 1 else found[0]
 
 
-def _on_host(tree: Tree) -> Tree:
-    """The arrays on the host, where they have values."""
-    return tree if any(isinstance(x, Tracer) for x in jax.tree.leaves(tree)) else jax.device_get(tree)
+def traced(tree: Tree) -> bool:
+    """Whether any of the arrays is part of a program that JAX is tracing."""
+    return any(isinstance(x, Tracer) for x in jax.tree.leaves(tree))

@@ -25,17 +25,15 @@ from more2_jax.geometry.free_space import (
     spread,
 )
 from more2_jax.geometry.point_to_plane import whole_surface
-from more2_jax.geometry.points import Sampled
-from more2_jax.geometry.transform import moved_sight, scale_sight
-from more2_jax.registration.starting_poses import Pair
-from more2_jax.registration.surface import CLEARLY, freed
+from more2_jax.geometry.transform import rescale, transform
+from more2_jax.registration.pose_costs import CLEARLY, free_space_cost
 from more2_jax.scans.read_scan import read_scan
 from more2_jax.scene import add_scan, start_scene
 from more2_jax.storage.scene_folder import load_scene, save_scene
-from more2_jax.tracking import identify as tracking
-from more2_jax.tracking.object_views import objects_with_sight, seen_from
+from more2_jax.tracking import relocalize
+from more2_jax.tracking.object_views import object_sights, seen_from
 from more2_jax.tracking.objects import seen_again
-from more2_jax.types import Embedding, Instance, Scan
+from more2_jax.types import Instance, Scan
 
 EYE = np.array([0.0, -3.0, 0.5])
 ROBUST = preset("robust", upright=True)
@@ -99,7 +97,7 @@ def test_it_moves_with_its_frame(sight, seed):
     rng = np.random.default_rng(seed)
     T = pieces.pose(Rotation.random(random_state=seed), rng.normal(size=3))
     points = rng.uniform(-1.5, 1.5, (400, 3))
-    here, there = free_at(sight, points), free_at(moved_sight(sight, T), pieces.apply(T, points))
+    here, there = free_at(sight, points), free_at(transform(sight, T), pieces.apply(T, points))
     same = np.abs(there - here) < 1e-3
     assert (here > 0).any() and same.mean() > 0.98  # but for points that lie on a pixel's edge
     near = rng.uniform([-0.4, -2.0, 0.1], [0.4, 0.9, 0.9], (400, 3))  # within the view, however it is turned
@@ -117,7 +115,7 @@ def test_scaling_and_views_that_fill_up_change_nothing(sight):
     assert padded.clear.shape == (VIEWS, PIXELS, PIXELS)
     np.testing.assert_allclose(free_at(padded, points - origin), free_at(sight, points), atol=1e-3)
     assert not free_at(blank, points).any()
-    doubled = free_at(scale_sight(padded, jnp.float32(2.0)), 2 * (points - origin))
+    doubled = free_at(rescale(padded, jnp.float32(2.0)), 2 * (points - origin))
     np.testing.assert_allclose(doubled, 2 * free_at(padded, points - origin), atol=1e-3)
     assert padded_sights([None, None], np.zeros((2, 3))) is None
 
@@ -160,32 +158,34 @@ def surfaces_of(points):
     return whole_surface(cloud, jnp.ones(len(cloud), bool))
 
 
-def pair_with(sight):
-    one, real = jnp.zeros((1, 3)), jnp.ones(1, bool)
-    cloud = Sampled(points=one, mask=real, dense=one, dense_mask=real)
-    code = Embedding(
-        inv=jnp.zeros(4), eqv=jnp.zeros((3, 4)), scale=jnp.ones(()), center=jnp.zeros(3), origin=jnp.zeros(3)
-    )
-    pair = Pair(source=cloud, target=cloud, source_code=code, target_code=code, offset=jnp.zeros(3))
+def on_the_device(sight):
+    """As one row of a batch has it."""
     batch = padded_sights([sight], np.zeros((1, 3)))
-    row = None if batch is None else jax.tree.map(lambda x: jnp.asarray(x[0]), batch)
-    return dataclasses.replace(pair, target_sight=row)
+    return jax.tree.map(lambda x: jnp.asarray(x[0]), batch)
 
 
 def test_a_pose_in_front_of_what_was_seen_costs_and_the_right_one_does_not(sight):
     still = jaxlie.SE3.identity()
     nearer = jaxlie.SE3.from_translation(jnp.array([0.0, -0.3, 0.0]))
     poses = jax.tree.map(lambda *x: jnp.stack(x), still, nearer)
-    face, config = surfaces_of(FACE[::20]), ROBUST.registration
-    right, wrong = freed(poses, pair_with(sight), face, face, config)
-    assert right < 0.05 * config.free_weight and wrong > 0.45 * config.free_weight
-    assert not freed(poses, pair_with(None), face, face, config).any()
-    silent = dataclasses.replace(config, free_weight=0.0)
-    assert not freed(poses, pair_with(sight), face, face, silent).any()
+    face, search, seen = surfaces_of(FACE[::20]), ROBUST.registration.search, on_the_device(sight)
+    right, wrong = free_space_cost(poses, (face, face), (None, seen), search, "upright")
+    assert right < 0.05 * search.free_weight and wrong > 0.45 * search.free_weight
+    _, back = free_space_cost(
+        jax.vmap(lambda T: T.inverse())(poses), (face, face), (seen, None), search, "upright"
+    )
+    assert float(back) == pytest.approx(float(wrong), abs=1e-5)
+    silent = dataclasses.replace(search, free_weight=0.0)
+    for sights, settings, motion in (
+        ((None, None), search, "upright"),
+        ((None, seen), silent, "upright"),
+        ((None, seen), search, "free"),
+    ):
+        assert not free_space_cost(poses, (face, face), sights, settings, motion).any()
 
 
-def test_only_robust_asks_for_it():
-    assert preset("paper").registration.free_weight == 0 < ROBUST.registration.free_weight
+def test_robust_asks_for_it():
+    assert ROBUST.registration.search.free_weight > 0
 
 
 # --- scenes -------------------------------------------------------------------------------------------------
@@ -207,11 +207,11 @@ def sights_asked(monkeypatch):
     """What registration is given, instead of registering."""
     given = []
 
-    def register(*_, source_sight, target_sight):
-        given.append((source_sight, target_sight))
+    def register(prior, pairs, *_):
+        given.append((pairs.source.sight, pairs.target.sight))
         raise Asked
 
-    monkeypatch.setattr(tracking, "register", register)
+    monkeypatch.setattr(relocalize, "register", register)
     return given
 
 
@@ -232,15 +232,13 @@ def test_registration_is_told_by_a_scene_in_memory_and_by_a_saved_one(tiny_prior
         np.testing.assert_allclose(one, other, atol=1e-5)
 
 
-def test_without_sensors_or_a_say_registration_is_told_nothing(tiny_prior, sights_asked):
-    sensors = np.array([[0.0, -4.0, 1.5]])
-    deaf = dataclasses.replace(ROBUST, registration=dataclasses.replace(ROBUST.registration, free_weight=0.0))
-    for config, places in ((ROBUST, np.zeros((0, 3))), (deaf, sensors)):
-        config = dataclasses.replace(config, matching=preset("paper").matching)
-        scene = start_scene(tiny_prior, scan_of("a", np.zeros(3), places), config)
-        with pytest.raises(Asked):
-            add_scan(tiny_prior, scene, scan_of("b", np.zeros(3), places), config)
-    assert sights_asked == [(None, None)] * 2
+def test_without_sensors_registration_is_told_nothing(tiny_prior, sights_asked):
+    config = dataclasses.replace(ROBUST, matching=preset("paper").matching)
+    nowhere = np.zeros((0, 3))
+    scene = start_scene(tiny_prior, scan_of("a", np.zeros(3), nowhere), config)
+    with pytest.raises(Asked):
+        add_scan(tiny_prior, scene, scan_of("b", np.zeros(3), nowhere), config)
+    assert sights_asked == [(None, None)]
 
 
 def test_an_objects_views_are_of_all_that_make_up_its_shape(tiny_prior):
@@ -251,13 +249,13 @@ def test_an_objects_views_are_of_all_that_make_up_its_shape(tiny_prior):
     seen = dataclasses.replace(scene.objects[0].observations[0], scan=1, T_ref_scan=T)
     twice = seen_again(scene.objects[0], scans[1].instances[0], seen)
     records = (*scene.scans, dataclasses.replace(scene.scans[0], index=1))
-    (both,) = objects_with_sight([twice], records)
-    np.testing.assert_allclose(both.sight.eye, [[0.0, -4.0, 1.5], [-0.5, -4.0, 1.5]])
+    (both,) = object_sights([twice], records)
+    np.testing.assert_allclose(both.eye, [[0.0, -4.0, 1.5], [-0.5, -4.0, 1.5]])
     doubted = seen_again(
         scene.objects[0], scans[1].instances[0], dataclasses.replace(seen, accumulated=False)
     )
-    (one,) = objects_with_sight([doubted], records)
-    np.testing.assert_allclose(one.sight.eye, sensors)
+    (one,) = object_sights([doubted], records)
+    np.testing.assert_allclose(one.eye, sensors)
     count = len(doubted.points) // 2
     np.testing.assert_allclose(seen_from(doubted, records), np.tile(sensors, (count, 1, 1)))
     places = seen_from(twice, records)
@@ -329,5 +327,6 @@ def test_a_benchmark_can_keep_the_places_from_the_method():
 
 def test_registration_is_measured_with_and_without_them():
     names = own_settings("robust", upright=True)
-    assert names["ours, robust"].free_weight > 0 == names["ours, robust, sensors unknown"].free_weight
+    assert names["ours, robust"].search.free_weight > 0
+    assert names["ours, robust, sensors unknown"].search.free_weight == 0
     assert not any("unknown" in name for name in own_settings("robust", upright=False))

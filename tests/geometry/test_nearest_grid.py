@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 from scipy.spatial import KDTree
 
-from more2_jax.geometry.nearest_grid import look_up, nearest_grid, scale_grid
+from more2_jax.geometry.nearest_grid import look_up, nearest_grid
+from more2_jax.geometry.transform import rescale
 
 
 @pytest.fixture(scope="module")
@@ -42,9 +43,7 @@ def test_in_another_unit_it_says_the_same(cloud):
     points, mask = cloud
     grid = nearest_grid(jnp.asarray(points), jnp.asarray(mask), 16)
     asked = jnp.asarray(np.random.default_rng(2).normal(size=(50, 3)), jnp.float32)
-    np.testing.assert_array_equal(
-        look_up(grid, asked), look_up(scale_grid(grid, jnp.asarray(8.0)), 8.0 * asked)
-    )
+    np.testing.assert_array_equal(look_up(grid, asked), look_up(rescale(grid, jnp.asarray(8.0)), 8.0 * asked))
 
 
 def test_one_point_is_nearest_everywhere():

@@ -17,7 +17,8 @@ from more2_jax.geometry.point_to_plane import (
     whole_surface,
 )
 from more2_jax.geometry.points import transformed
-from more2_jax.registration.surface import choose, competing, misfit
+from more2_jax.registration.pose_costs import misfit, turned_apart
+from more2_jax.registration.surface import TURNED_DEG, choose, nearly_as_good
 
 POINTS = 256
 
@@ -35,8 +36,8 @@ def as_surface(points, mask=None):
     return whole_surface(jnp.asarray(points, jnp.float32), jnp.asarray(mask))
 
 
-aligned = jax.jit(align, static_argnames=("reach", "steps", "upright"))
-covariance_of = jax.jit(pose_covariance, static_argnames=("reach", "upright"))
+aligned = jax.jit(align, static_argnames=("reach", "steps", "motion"))
+covariance_of = jax.jit(pose_covariance, static_argnames=("reach", "motion"))
 
 
 def test_normals_of_flat_faces_are_their_axes():
@@ -98,18 +99,18 @@ def test_points_are_moved_as_jaxlie_moves_them(degrees):
     np.testing.assert_allclose(transformed(T, points), T @ points, atol=1e-6)
 
 
-@pytest.mark.parametrize("upright", [False, True])
-def test_alignment_recovers_a_displacement_and_upright_never_tilts(upright):
+@pytest.mark.parametrize("motion", ["free", "upright"])
+def test_alignment_recovers_a_displacement_and_upright_never_tilts(motion):
     points, _ = box_points(np.random.default_rng(2))
     turn = Rotation.from_euler("z", 12, degrees=True)
-    if not upright:
+    if motion == "free":
         turn = Rotation.from_rotvec(np.deg2rad(12) * np.array([0.6, 0, 0.8]))
     moved = turn.apply(points) + [0.03, -0.02, 0.04]
-    T = aligned(jaxlie.SE3.identity(), as_surface(points), as_surface(moved), (0.15, 0.02), 25, upright)
+    T = aligned(jaxlie.SE3.identity(), as_surface(points), as_surface(moved), (0.15, 0.02), 25, motion)
     R = np.asarray(T.rotation().as_matrix())
     assert np.rad2deg(np.arccos(min(1, (np.trace(R @ turn.as_matrix().T) - 1) / 2))) < 0.5
     assert np.abs(np.asarray(T.translation()) - [0.03, -0.02, 0.04]).max() < 0.005
-    if upright:
+    if motion == "upright":
         np.testing.assert_allclose(R[2], [0, 0, 1], atol=1e-6)
 
 
@@ -120,9 +121,9 @@ def test_degenerate_clouds_give_finite_poses():
     one = np.zeros((64, 3))
     for points in (flat, line, one):
         s = as_surface(points)
-        T = aligned(jaxlie.SE3.identity(), s, s, (0.15, 0.02), 25, False)
+        T = aligned(jaxlie.SE3.identity(), s, s, (0.15, 0.02), 25, "free")
         assert np.isfinite(np.asarray(T.wxyz_xyz)).all()
-        assert np.isfinite(np.asarray(covariance_of(T, s, s, 0.05, False))).all()
+        assert np.isfinite(np.asarray(covariance_of(T, s, s, 0.05, "free"))).all()
 
 
 def test_covariance_is_the_spread_over_repeated_noise_up_to_a_small_factor():
@@ -131,9 +132,9 @@ def test_covariance_is_the_spread_over_repeated_noise_up_to_a_small_factor():
     target, noise, ends, said = as_surface(points), 0.004, [], []
     for _ in range(12):
         source = as_surface(points + rng.normal(0, noise, points.shape))
-        T = aligned(jaxlie.SE3.identity(), source, target, (0.15, 0.05), 15, False)
+        T = aligned(jaxlie.SE3.identity(), source, target, (0.15, 0.05), 15, "free")
         ends.append(np.asarray(T.log()))
-        said.append(np.sqrt(np.diagonal(np.asarray(covariance_of(T, source, target, 0.05, False)))))
+        said.append(np.sqrt(np.diagonal(np.asarray(covariance_of(T, source, target, 0.05, "free")))))
     ratio = np.std(ends, axis=0) / np.mean(said, axis=0)
     assert (ratio > 0.2).all() and (ratio < 5).all()
 
@@ -153,8 +154,9 @@ def test_it_stayed_wins_when_as_good_and_loses_when_worse():
     assert int(choose(jnp.array([0.2, 0.21]), stayed_is_last=False)) == 0
 
 
-def test_only_poses_as_good_and_turned_otherwise_compete():
+def test_poses_compete_that_are_turned_otherwise_and_nearly_as_good():
     turns = jnp.deg2rad(jnp.array([0.0, 3, 180, 180]))
     poses = jaxlie.SE3.from_rotation(jax.vmap(jaxlie.SO3.from_z_radians)(turns))
-    found = competing(poses, jnp.array([0.1, 0.1, 0.105, 0.4]), jnp.array(0))
-    assert found.tolist() == [False, False, True, False]
+    costs, best = jnp.array([0.1, 0.1, 0.105, 0.4]), jnp.array(0)
+    assert turned_apart(poses, best, TURNED_DEG).tolist() == [False, False, True, True]
+    assert nearly_as_good(costs, best).tolist() == [True, True, True, False]

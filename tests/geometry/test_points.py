@@ -14,7 +14,6 @@ from more2_jax.geometry.points import (
     chamfer_distance,
     cloud_radius,
     dominant_eigenvector,
-    evenly,
     farthest_points,
     horn_matrix,
     icp,
@@ -22,6 +21,7 @@ from more2_jax.geometry.points import (
     kabsch_rotation,
     nearest,
     sample,
+    thin,
     trimmed,
     two_way_rms,
 )
@@ -130,7 +130,7 @@ def test_trimmed_keeps_the_smallest_share_of_what_is_real():
 
 def test_two_way_rms_by_definition():
     a, b = RNG.normal(size=(20, 3)), RNG.normal(size=(31, 3))
-    one, other = (sample(f32(x), every(len(x)), len(x), dense=True) for x in (a, b))
+    one, other = (sample(f32(x), every(len(x)), len(x)) for x in (a, b))
     distances = cdist(a, b)
     ways = [np.sqrt(np.mean(distances.min(axis=k) ** 2)) for k in (0, 1)]
     assert float(two_way_rms(one, other, 1.0)) == pytest.approx(np.mean(ways), rel=1e-3)
@@ -138,13 +138,21 @@ def test_two_way_rms_by_definition():
     assert float(two_way_rms(one, other, 0.5)) < np.mean(ways)
 
 
-def test_a_sample_beside_all_or_beside_nothing_more():
-    thin = sample(f32(CLOUD), every(50), 10, dense=False)
-    np.testing.assert_array_equal(thin.points, thin.dense)
-    full = sample(f32(CLOUD), every(50), 10, dense=True)
-    np.testing.assert_array_equal(full.dense, CLOUD)
-    assert isinstance(full, Sampled)
-    np.testing.assert_array_equal(evenly(full, 5).points, CLOUD[::5])
+def test_a_sample_stands_beside_nothing_more():
+    few = sample(f32(CLOUD), every(50), 10)
+    assert isinstance(few, Sampled)
+    np.testing.assert_array_equal(few.points, farthest_points(f32(CLOUD), every(50), 10)[0])
+    np.testing.assert_array_equal(few.points, few.dense)
+
+
+def test_thinning_takes_the_real_rows_evenly_and_all_where_there_are_fewer():
+    mask = np.arange(50) % 2 == 1
+    index, real = thin(jnp.asarray(mask), 5)
+    np.testing.assert_array_equal(index, np.arange(50)[mask][::5])
+    assert bool(real.all())
+    index, real = thin(jnp.asarray(mask), 40)
+    np.testing.assert_array_equal(index[real], np.arange(50)[mask])
+    assert int(real.sum()) == 25
 
 
 def test_chamfer_by_definition_and_blind_to_padding():
@@ -287,8 +295,8 @@ def test_radius():
 def test_icp_walks_home_from_nearby():
     R = Rotation.from_rotvec([0.05, -0.1, 0.08]).as_matrix()
     stretched = CLOUD * [1, 3, 2]
-    source = sample(f32(stretched), every(50), 50, dense=True)
-    target = sample(f32(stretched @ R.T + 0.05), every(50), 50, dense=True)
+    source = sample(f32(stretched), every(50), 50)
+    target = sample(f32(stretched @ R.T + 0.05), every(50), 50)
     T = icp(kabsch(f32(CLOUD), f32(CLOUD), jnp.ones(50)), source, target, 1.0, 20)
     np.testing.assert_allclose(T.rotation().as_matrix(), R, atol=1e-3)
     np.testing.assert_allclose(T.translation(), np.full(3, 0.05), atol=1e-3)

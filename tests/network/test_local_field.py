@@ -13,7 +13,7 @@ from compiling import quick_jit
 from places import ROOT
 
 from more2_jax.config import load_config
-from more2_jax.geometry.transform import move_embedding, scale_embedding
+from more2_jax.geometry.transform import rescale, transform
 from more2_jax.network.local_field import LEAST_SPREAD, LocalLookup, from_plane, local_width
 from more2_jax.network.prior import encode_one, init_prior, sdf_one
 from more2_jax.types import Anchors
@@ -148,7 +148,7 @@ def test_field_moves_and_grows_with_the_cloud(prior, cloud):
     moved = jax.vmap(lambda p: T @ (2.5 * p))
     again = encoded(prior, moved(cloud), mask)
     np.testing.assert_allclose(distance(prior, again, moved(queries)), expected, atol=5e-4)
-    carried = move_embedding(scale_embedding(embedding, jnp.float32(2.5)), T)
+    carried = transform(rescale(embedding, jnp.float32(2.5)), T)
     np.testing.assert_allclose(distance(prior, carried, moved(queries)), expected, atol=1e-4)
 
 

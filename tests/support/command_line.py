@@ -15,8 +15,13 @@ from train.run.settings import TrainingRun
 TINY = load_config(ROOT / "configs/tiny.yaml", TrainingRun).model
 # Few steps: the command line is under test here, not the method.
 QUICK = """
+matching: {method: evidence, search: {points: 32, dense: 64, cells: 8, turns: 4, steps: 2, keep: 1}}
 registration:
-  {points: 64, coarse_points: 32, coarse_steps: 2, keep_starts: 1, yaw_starts: 0, steps: 2, icp_steps: 2}
+  method: surface
+  points: 64
+  steps: 2
+  polish_steps: 2
+  search: {points: 32, dense: 64, cells: 8, turns: 4, steps: 2, keep: 1}
 joint: {points: 64, steps: 2}
 meshing: {coarse: 8, resolution: 16}
 """

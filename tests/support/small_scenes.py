@@ -13,9 +13,11 @@ from more2_jax.types import Instance, Mesh, Scan
 
 MARK = Mesh(vertices=np.zeros((3, 3)), faces=np.array([[0, 1, 2]]))
 ROBUST = preset("robust", upright=True)
+SEARCH = dataclasses.replace(ROBUST.registration.search, turns=8, keep=2)
 CONFIG = dataclasses.replace(
     ROBUST,
-    registration=dataclasses.replace(ROBUST.registration, yaw_starts=8, steps=3, icp_steps=8, keep_starts=2),
+    matching=dataclasses.replace(ROBUST.matching, search=SEARCH),
+    registration=dataclasses.replace(ROBUST.registration, search=SEARCH),
     joint=JointConfig(points=32, start="accumulated", steps=3),
     meshing=dataclasses.replace(ROBUST.meshing, coarse=16, resolution=16),
 )
