@@ -16,7 +16,7 @@ C = TypeVar("C")
 
 @dataclass(frozen=True)
 class EncoderConfig:
-    """Encoder Φ (METHOD 1); the defaults are the published widths."""
+    """Encoder Φ (paper §3.1); the defaults are the published widths."""
 
     widths: tuple[int, ...] = (32, 32, 64, 64, 128, 256, 512)
     code: int = 256
@@ -32,7 +32,7 @@ class EncoderConfig:
 
 @dataclass(frozen=True)
 class DecoderConfig:
-    """Decoder Ψ (METHOD 1), a DeepSDF network."""
+    """Decoder Ψ (paper §3.1), a DeepSDF network."""
 
     hidden: int = 768
     layers: int = 8  # hidden layers
@@ -70,7 +70,7 @@ class SurfaceSearch:
     points: int = 128  # of either cloud, compared with
     dense: int = 1024  # so many of the other, found by a table
     cells: int = 24  # a side of that table
-    steps: int = 12
+    steps: int = 12  # of alignment, of every start
     first_reach: float = 0.3  # correspondences this far apart count a quarter, in the first step
     last_reach: float = 0.1  # and in the last
     keep: int = 6  # poses, each turned otherwise
@@ -84,16 +84,18 @@ class SurfaceSearch:
 class CodeMatcher:
     """Matching by the embeddings alone (paper §3.2)."""
 
-    method: Literal["codes"] = "codes"
+    method: Literal["codes"] = "codes"  # names these settings
     score: Literal["inv", "eqv", "both"] = "both"  # Λ, 1/E, Λ ⊘ E
-    assignment: Literal["hungarian", "greedy"] = "hungarian"
+    assignment: Literal["hungarian", "greedy"] = (
+        "hungarian"  # the best total, or (published code) best pair first
+    )
 
 
 @dataclass(frozen=True)
 class EvidenceMatcher:
     """Matching by surfaces: the embeddings propose pairs, how well a pair's surfaces fit decides (beyond the paper)."""
 
-    method: Literal["evidence"] = "evidence"
+    method: Literal["evidence"] = "evidence"  # names these settings
     candidates: int = 8  # partners of every object, and of every instance, that are aligned; 0: all
     size_weight: float = (
         0.5  # of |log| of the ratio of the F_s, against the cosine of the F_inv, in what is proposed
@@ -107,14 +109,14 @@ class EvidenceMatcher:
 class DescentRegistration:
     """Registration by descent on the signed distance field, then ICP (paper §3.3)."""
 
-    method: Literal["descent"] = "descent"
+    method: Literal["descent"] = "descent"  # names these settings
     points: int = 1024  # of the farthest-point samples
     sdf_points: int = 1024  # of them, how many are asked of the field
     steps: int = 200  # Adam on SE(3)
     learning_rate: float = 1e-3  # radians, and shares of the target's radius
-    sdf_weight: float = 1.0
-    chamfer_weight: float = 1.0
-    icp_steps: int = 30
+    sdf_weight: float = 1.0  # of |Ψ| at the moved source's points, in the loss
+    chamfer_weight: float = 1.0  # of the Chamfer distance
+    icp_steps: int = 30  # after the descent
     trim: float = 1.0  # share of nearest distances that counts
     converged_rms: float = 0.05  # share of the target's radius
 
@@ -126,11 +128,11 @@ class SurfaceRegistration:
     Refines the poses that matching found, or those of `search` where it is given none.
     """
 
-    method: Literal["surface"] = "surface"
+    method: Literal["surface"] = "surface"  # names these settings
     search: SurfaceSearch = field(default_factory=SurfaceSearch)
     try_stayed: bool = True  # also "it did not move", which is chosen if it fits nearly as well as the best
     points: int = 256  # of each cloud, compared with all of the other
-    steps: int = 15
+    steps: int = 15  # of alignment, of every pose
     first_reach: float = 0.1  # of a correspondence, in the first step
     last_reach: float = 0.03  # and in the last
     choose_among: int = (
@@ -139,9 +141,9 @@ class SurfaceRegistration:
     field_points: int = 1024  # of each cloud, asked of the other's completed surface
     polish_points: int = 512  # then, for the best pose alone
     polish_steps: int = 10
-    polish_reach: float = 0.02
+    polish_reach: float = 0.02  # of a correspondence, in its last step
     trim: float = 0.7  # share of nearest distances that counts in the residual
-    converged_rms: float = 0.05
+    converged_rms: float = 0.05  # residual below which a pose that has settled is called converged
 
 
 Matcher = CodeMatcher | EvidenceMatcher
@@ -152,7 +154,7 @@ MotionModel = Literal["free", "upright"]
 
 @dataclass(frozen=True)
 class JointConfig:
-    """Joint optimization (METHOD 6); the defaults are the paper's."""
+    """Joint optimization (paper §3.5); the defaults are the paper's."""
 
     points: int = 1024
     start: Literal["best", "accumulated"] = (
@@ -167,7 +169,7 @@ class JointConfig:
 
 @dataclass(frozen=True)
 class MeshingConfig:
-    """Mesh extraction (METHOD 5): multi-resolution iso-surface extraction, then marching cubes."""
+    """Mesh extraction (paper §3.4): multi-resolution iso-surface extraction, then marching cubes."""
 
     coarse: int = 32  # cells a side of the first grid
     resolution: int = 64  # of the last: `coarse`, doubled once or more
@@ -204,16 +206,15 @@ class ClosingConfig:
 
 @dataclass(frozen=True)
 class SceneConfig:
-    """The whole method; `preset('paper')` is METHOD to the letter, `preset('robust')` the default."""
+    """The whole method; `preset('paper')` is the paper to the letter, `preset('robust')` the default."""
 
-    preset: str = "paper"
-    upright: bool = False
+    preset: str = "paper"  # whose settings these are, or began as
+    upright: bool = False  # objects turn about the vertical (z) only
     min_points: int = 64  # objects seen with fewer are skipped, and reported
-    static_deg: float = 1.0  # below both: static
-    static_m: float = 0.05
-    accumulate_target: bool = (
-        False  # match and register against all seen so far, not the reference observation
-    )
+    static_deg: float = 1.0  # an object that turned by less,
+    static_m: float = 0.05  # and moved by less, is static
+    # Match and register against all seen so far, not the reference observation.
+    accumulate_target: bool = False
     accumulate_misfit: float = 1.0  # an observation whose registration fits worse is left out of the shape
     matching: Matcher = field(default_factory=CodeMatcher)
     registration: RegistrationMethod = field(default_factory=DescentRegistration)

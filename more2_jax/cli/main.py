@@ -16,6 +16,7 @@ from more2_jax.cli import priors, scenes
 from more2_jax.cli.options import Reading, Reporting
 from more2_jax.cli.session import one_line
 from more2_jax.cli.settings import scene_config
+from more2_jax.cli.settings_page import settings_page
 
 PresetName = Literal["robust", "paper"]
 BAD_INPUT = (ValueError, FileNotFoundError, PermissionError, IsADirectoryError, NotADirectoryError)
@@ -260,6 +261,21 @@ class PriorCommand:
         return self.action()
 
 
+@dataclass(frozen=True)
+class Settings:
+    """Every setting of a preset on one page, as Markdown: name, value, meaning.
+
+    Example: more2 settings --preset robust
+    """
+
+    preset: PresetName = "robust"
+    """robust: several starts a pair. paper: the method to the letter."""
+
+    def __call__(self) -> int:
+        print(settings_page(scene_config(self.preset, False, None)), end="")
+        return 0
+
+
 Command = (
     Annotated[Demo, subcommand("demo")]
     | Annotated[Run, subcommand("run")]
@@ -267,6 +283,7 @@ Command = (
     | Annotated[Inspect, subcommand("inspect")]
     | Annotated[Show, subcommand("show")]
     | Annotated[Export, subcommand("export")]
+    | Annotated[Settings, subcommand("settings")]
     | Annotated[PriorCommand, subcommand("prior")]
 )
 
