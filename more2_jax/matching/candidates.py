@@ -70,30 +70,28 @@ def align_candidates(
     """Aligns the likeliest pairs of `old` (scene's frame) and `new` (scan's frame).
 
     `T_scene_scan`: how the scan is taken to lie, for what did not move; by default in the scene's frame. Raises
-    ValueError where the prior is asked (any orientation, `search.field_weight`) about another encoder's records.
+    ValueError as `check_asked` does.
     """
-    if asks_prior(matcher.search, motion):
-        for o in (*old, *new):
-            check_embedding(prior, o.embedding, "match")
+    check_asked(prior, (*old, *new), matcher, motion)
     known = compared(old, new)
     among = proposed(proposal_of(known, matcher), matcher.candidates)
     rows = np.argwhere(among)[:, ::-1]
     source, target = local_batch(new), local_batch(old)
     ready = [alignable(side, matcher.search) for side in (source, target)]
     pairs = paired_rows(source, target, rows, np.eye(4) if T_scene_scan is None else T_scene_scan)
-    instances, known_objects = (
+    instances, objects = (
         jax.tree.map(lambda x, at=at: x[at], side) for side, at in zip(ready, rows.T, strict=True)
     )
-    found = search_poses(instances, known_objects, pairs.stayed, matcher.search, motion)
+    found = search_poses(instances, objects, pairs.stayed, matcher.search, motion)
     off, own = np.zeros((*found.cost.shape, 2)), np.zeros(len(rows))
     if asks_prior(matcher.search, motion):
-        found, off = off_completed_surfaces(prior, instances, known_objects, found, matcher.search)
+        found, off = off_completed_surfaces(prior, instances, objects, found, matcher.search)
         own = np.max([off_own_surface(prior, x)[at] for x, at in zip(ready, rows.T, strict=True)], axis=0)
     (_, top), (_, other) = heights(old), heights(new)
     return AlignedPairs(
         among=among,
         pairs=pairs,
-        objects=(instances, known_objects),
+        objects=(instances, objects),
         found=found,
         T_old_new=pairs.to_world(found.poses),
         compared=Compared(**{k: v[among] for k, v in vars(known).items()}),
@@ -102,6 +100,15 @@ def align_candidates(
         off_own=own,
         height_m=0.0 if T_scene_scan is None else float(T_scene_scan[2, 3]),
     )
+
+
+def check_asked(
+    prior: Prior, objects: Sequence[ObservedObject], matcher: EvidenceMatcher, motion: MotionModel
+) -> None:
+    """Raises ValueError where the prior is asked (any orientation) about the records of another encoder."""
+    if asks_prior(matcher.search, motion):
+        for o in objects:
+            check_embedding(prior, o.embedding, "match")
 
 
 def odds_of(

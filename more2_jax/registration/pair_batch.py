@@ -42,7 +42,8 @@ class PairBatch:
 
     def to_world(self, poses: jaxlie.SE3) -> Float[np.ndarray, "*batch 4 4"]:
         """Poses T_target_source between the scans' own frames, float64, from local ones: (batch,) or (batch, k)."""
-        origins = [np.asarray(side.origin, np.float64) for side in (self.target, self.source)]
+        sides = (self.target.origin, self.source.origin)
+        origins = [np.zeros((len(self), 3)) if o is None else np.asarray(o, np.float64) for o in sides]
         if len(poses.wxyz_xyz.shape) == 3:
             origins = [o[:, None] for o in origins]
         return world_poses(poses, *origins)
@@ -62,12 +63,14 @@ def pair_up(
     sizes = [len(x) for side in (source, target) for x in (side.cloud.points, side.code.scale)]
     if len(set(sizes)) != 1:
         raise ValueError(f"pair_up got {sizes} clouds and codes of sources and targets; needed equal numbers")
-    if isinstance(source.origin, Tracer) or isinstance(target.origin, Tracer):
-        shift = jnp.asarray(source.origin) - jnp.asarray(target.origin)
+    # Objects without an origin are about the zero of their scan's frame.
+    origins = [np.zeros((sizes[0], 3)) if s.origin is None else s.origin for s in (source, target)]
+    if any(isinstance(o, Tracer) for o in origins):
+        shift = jnp.asarray(origins[0]) - jnp.asarray(origins[1])
         stayed = jaxlie.SE3.from_rotation_and_translation(jaxlie.SO3.identity((len(shift),)), shift)
-        return PairBatch(source=source, target=target, stayed=stayed, candidates=candidates)
-    T = np.broadcast_to(np.eye(4) if T_target_source is None else T_target_source, (sizes[0], 4, 4))
-    stayed = local_poses(T, np.asarray(target.origin), np.asarray(source.origin))
+    else:
+        T = np.broadcast_to(np.eye(4) if T_target_source is None else T_target_source, (sizes[0], 4, 4))
+        stayed = local_poses(T, np.asarray(origins[1]), np.asarray(origins[0]))
     return PairBatch(source=source, target=target, stayed=stayed, candidates=candidates)
 
 

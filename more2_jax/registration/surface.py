@@ -104,20 +104,14 @@ def refine_pair(
     Works in units of the target's radius. `loss` and `misfit` are the truncated distance. Differentiable, the
     correspondences held.
     """
-    radius, search = target.radius, settings.search
+    radius = target.radius
     source, target = rescale(source, 1 / radius), rescale(target, 1 / radius)
     starts, stayed = scaled_pose(candidates, 1 / radius), scaled_pose(stayed, 1 / radius)
     s, t = thinned(source.whole, settings.points), thinned(target.whole, settings.points)
-    one_stayed = jax.tree.map(lambda x: x[None], stayed)
-    if settings.try_stayed:
-        starts = concatenated(starts, one_stayed)
-    reach = (settings.first_reach, settings.last_reach)
-    poses = jax.vmap(lambda T: align(T, s, t, reach, settings.steps, motion))(starts)
-    if settings.try_stayed:
-        poses = concatenated(poses, one_stayed)  # also exactly as it is
+    poses = refined(starts, stayed, s, t, settings, motion)
     misfits = jax.vmap(lambda T: misfit(T, s, t, truncations(settings)))(poses)
-    costs = misfits + height_cost(poses, stayed, search, motion)
-    costs += free_space_cost(poses, (s, t), (source.sight, target.sight), search, motion)
+    costs = misfits + height_cost(poses, stayed, settings.search, motion)
+    costs += free_space_cost(poses, (s, t), (source.sight, target.sight), settings.search, motion)
     chosen = finalists(costs, poses, settings)
     poses, misfits, costs = jax.tree.map(lambda x: x[chosen], (poses, misfits, costs))
     doubt = prior_cost(prior, poses, costs, (source, target), settings)
@@ -125,15 +119,31 @@ def refine_pair(
     T = polished(jax.tree.map(lambda x: x[best], poses), (source, target), misfits[best], settings, motion)
     if settings.try_stayed:  # what stayed is exactly where it was
         T = jax.tree.map(lambda x, y: jnp.where(best == len(misfits) - 1, y, x), T, stayed)
-    found = scored(T, s, t, settings, motion)
     found = dataclasses.replace(
-        found,
+        scored(T, s, t, settings, motion),
         loss=misfits[best],
         misfit=misfits[best],
         competing=poses,
         competes=turned_apart(poses, best, TURNED_DEG) & nearly_as_good(costs + doubt, best),
     )
     return rescale(found, radius)
+
+
+def refined(
+    starts: jaxlie.SE3,
+    stayed: jaxlie.SE3,
+    source: Surface,
+    target: Surface,
+    settings: SurfaceRegistration,
+    motion: MotionModel,
+) -> jaxlie.SE3:
+    """Every start aligned; where it is tried, also "it did not move", aligned and exactly as it is (the last)."""
+    one = jax.tree.map(lambda x: x[None], stayed)
+    if settings.try_stayed:
+        starts = concatenated(starts, one)
+    reach = (settings.first_reach, settings.last_reach)
+    poses = jax.vmap(lambda T: align(T, source, target, reach, settings.steps, motion))(starts)
+    return concatenated(poses, one) if settings.try_stayed else poses
 
 
 def truncations(settings: SurfaceRegistration) -> tuple[float, float]:

@@ -55,7 +55,8 @@ def test_prior_check_passes_only_below_the_limit(monkeypatch, capsys, deviations
         "check_prior": lambda weights, arrays: asked.append(weights) or deviations,
     }
     for name, stand_in in stand_ins.items():
-        monkeypatch.setattr(f"more2_jax.network.torch_checkpoint.{name}", stand_in)
+        home = "torch_checkpoint" if name == "read_checkpoint" else "parity"
+        monkeypatch.setattr(f"more2_jax.network.{home}.{name}", stand_in)
     files = ["reference.npz"] if alone else ["published.pt", "reference.npz"]
     assert main(["prior", "check", *files]) == code
     assert asked == ["reference.npz", inside if alone else outside]
