@@ -131,34 +131,55 @@ FOLDERS = {
 MODULES |= {f"{old}.{m}": f"{new}.{m}" for old, (new, modules) in FOLDERS.items() for m in modules.split()}
 # Names that left for another module than the rest of their own: old module → new module → names.
 NAMES = {
-    "checkpoint": {"more2_jax.network.parity": "check_prior read_reference weights_of_reference"},
-    "data.flying_shape": {"train.furniture.symmetry": "yaw_symmetry"},
-    "evidence": {
-        "more2_jax.matching.calibration": "Calibration Compared FREE HIGHEST UNASKED UNKNOWN UPRIGHT calibrated "
-        "features log_odds weighed",
+    "checkpoint": {
+        "more2_jax.network.parity": "check_prior read_reference weights_of_reference",
     },
-    "fitting": {"more2_jax.geometry.poses": "local_pose"},
+    "data.flying_shape": {
+        "train.furniture.symmetry": "yaw_symmetry",
+    },
+    "evidence": {
+        "more2_jax.matching.calibration": "Calibration Compared FREE HIGHEST UNASKED UNKNOWN UPRIGHT calibrated features log_odds weighed",
+    },
+    "fitting": {
+        "more2_jax.geometry.poses": "local_pose",
+    },
     "frames": {
         "more2_jax.geometry.floor": "FLOOR_SHARE LAYER_M STRAY floor_height",
-        "more2_jax.geometry.transform": "lift moved moved_embedding",
-        "more2_jax.tracking.scan_height": "AS_GOOD_VOTES CLEARLY LEAST_M Rooms SPREAD_M best_vote common_height "
-        "doubtful explained height_votes settled support",
+        "more2_jax.geometry.poses": "lift",
+        "more2_jax.geometry.transform": "moved moved_embedding",
+        "more2_jax.tracking.scan_height": "AS_GOOD_VOTES CLEARLY LEAST_M Rooms SPREAD_M best_vote common_height doubtful height_votes support",
     },
-    "objects": {"more2_jax.geometry.poses": "Points Pose apply_pose"},
+    "objects": {
+        "more2_jax.geometry.poses": "Points Pose apply_pose",
+    },
     "registration": {
-        "more2_jax.geometry.poses": "world_pose",
-        "more2_jax.registration.descent": "STAYED_OFFSET STAYED_RATIO STILL choose keep_best refine registration_loss "
-        "residual score_pose with_stayed",
+        "more2_jax.registration.older_calls": "world_pose",
+        "more2_jax.registration.descent": "STILL refine registration_loss",
     },
-    "sight": {"more2_jax.geometry.transform": "moved_sight scale_sight"},
-    "types": {"more2_jax.geometry.transform": "move_embedding scale_embedding"},
+    "sight": {
+        "more2_jax.geometry.transform": "moved_sight scale_sight",
+    },
+    "types": {
+        "more2_jax.geometry.transform": "move_embedding scale_embedding",
+    },
     "verification": {
         "more2_jax.geometry.poses": "in_frames",
         "more2_jax.matching.assignment": "AS_GOOD FARTHEST_M LEAST_GAIN LogOdds NEVER assign interchangeable unmatched",
         "more2_jax.types": "Known",
     },
 }
-CALLED = {"Known": "ObservedObject"}
+CALLED = {
+    "Known": "ObservedObject",
+    "in_frames": "world_poses",
+    "lift": "vertical_shift",
+    "local_pose": "local_poses",
+    "move_embedding": "transform",
+    "moved": "transform",
+    "moved_embedding": "transform",
+    "moved_sight": "transform",
+    "scale_embedding": "rescale",
+    "scale_sight": "rescale",
+}
 SPELLED = {
     "catalogue": "catalog",
     "initialise": "initialize",
