@@ -54,8 +54,6 @@ MODULES = {
     "data.inspection": "more2_jax.scans.inspection",
     "data.json_file": "more2_jax.scans.files.json_file",
     "data.labelled": "more2_jax.scans.labeled_cloud",
-    "data.loading": "train.shards.loading",
-    "data.lzf": "more2_jax.scans.files.lzf",
     "data.masks": "more2_jax.scans.predicted_masks",
     "data.mesh_files": "train.furniture.mesh_files",
     "data.meshes": "train.furniture.collections",
@@ -75,10 +73,9 @@ MODULES = {
     "data.signed_distance": "train.shards.signed_distance",
     "data.solids": "train.furniture.closed_solids",
     "data.source_mesh": "train.furniture.source_mesh",
-    "data.stretching": "train.shards.stretching",
     "data.structural": "more2_jax.scans.structural_labels",
     "data.sweethome3d": "train.furniture.sweethome3d",
-    "data.threerscan_index": "more2_jax.scans.threerscan_index",
+    "data.threerscan_index": "eval.data.threerscan_index",
     "decoder": "more2_jax.network.decoder",
     "demo": "more2_jax.cli.demo_score",
     "descent": "more2_jax.geometry.se3_descent",
@@ -138,7 +135,8 @@ NAMES = {
         "train.furniture.symmetry": "yaw_symmetry",
     },
     "evidence": {
-        "more2_jax.matching.calibration": "Calibration Compared FREE HIGHEST UNASKED UNKNOWN UPRIGHT calibrated features log_odds weighed",
+        "more2_jax.matching.calibration": "Calibration Compared FREE HIGHEST UNASKED "
+        "UNKNOWN UPRIGHT calibrated features log_odds weighed",
     },
     "fitting": {
         "more2_jax.geometry.poses": "local_pose",
@@ -147,7 +145,8 @@ NAMES = {
         "more2_jax.geometry.floor": "FLOOR_SHARE LAYER_M STRAY floor_height",
         "more2_jax.geometry.poses": "lift",
         "more2_jax.geometry.transform": "moved moved_embedding",
-        "more2_jax.tracking.scan_height": "AS_GOOD_VOTES CLEARLY LEAST_M Rooms SPREAD_M best_vote common_height doubtful height_votes support",
+        "more2_jax.tracking.scan_height": "AS_GOOD_VOTES CLEARLY LEAST_M Rooms SPREAD_M "
+        "best_vote common_height doubtful height_votes support",
     },
     "objects": {
         "more2_jax.geometry.poses": "Points Pose apply_pose",
@@ -164,7 +163,8 @@ NAMES = {
     },
     "verification": {
         "more2_jax.geometry.poses": "in_frames",
-        "more2_jax.matching.assignment": "AS_GOOD FARTHEST_M LEAST_GAIN LogOdds NEVER assign interchangeable unmatched",
+        "more2_jax.matching.assignment": "AS_GOOD FARTHEST_M LEAST_GAIN LogOdds "
+        "NEVER assign interchangeable unmatched",
         "more2_jax.types": "Known",
     },
 }

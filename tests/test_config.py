@@ -5,6 +5,7 @@ import dataclasses
 import pytest
 from places import ROOT
 
+from more2_jax.cli.settings import scene_config
 from more2_jax.config import (
     CodeMatcher,
     DescentRegistration,
@@ -129,6 +130,14 @@ def test_each_algorithm_has_settings_of_its_own_chosen_by_its_name():
 def test_settings_of_another_algorithm_or_of_none_are_named(values, complaint):
     with pytest.raises(ValueError, match=complaint):
         from_dict(SceneConfig, values)
+
+
+def test_a_file_may_put_another_algorithm_in_place_of_the_presets(tmp_path):
+    path = tmp_path / "mine.yaml"
+    path.write_text("matching: {method: codes}\nregistration: {method: surface, steps: 3}\n")
+    config, robust = scene_config("robust", True, path), preset("robust", upright=True)
+    assert config.matching == CodeMatcher()
+    assert config.registration == dataclasses.replace(robust.registration, steps=3)
 
 
 def test_whole_numbers_are_floats_and_missing_keys_keep_their_defaults():

@@ -22,13 +22,13 @@ data.fan_out data.flying_cameras data.flying_scenes data.flying_shape data.forma
 data.formats.arkitscenes data.formats.e57 data.formats.las data.formats.npz_scan data.formats.pcd
 data.formats.ply_folder data.formats.ply_scan data.formats.registry data.formats.replica
 data.formats.s3dis data.formats.scannet data.formats.scannetpp data.formats.threerscan data.furnishing
-data.heldout data.inspection data.json_file data.labelled data.loading data.lzf data.masks
+data.heldout data.inspection data.json_file data.labelled data.masks
 data.mesh_files data.meshes data.npz_file data.packed data.ply data.ply_mesh data.procedural
 data.procedural.backs data.procedural.fronts data.procedural.furniture data.procedural.others
 data.procedural.parts data.procedural.seating data.procedural.soft data.procedural.storage
 data.procedural.supports data.procedural.tables data.rgbd_sequence data.sampling data.scans
 data.segment_groups data.segmentation data.shapenet data.shapes data.shards data.signed_distance
-data.solids data.source_mesh data.stretching data.structural data.sweethome3d data.threerscan_index
+data.solids data.source_mesh data.structural data.sweethome3d 
 decoder demo descent encoder encoding evidence fitting frames in_turn io joint lattice local_field
 losses meshfile nearest_grid neighbours objects orientation outliers planes pose_graph prior published
 screened_poisson seen_surface sight sights starts surface_registration verification vn
@@ -62,7 +62,9 @@ def own_names(module) -> list[str]:
     of = getattr(module, "__all__", vars(module))
     objects = [(n, getattr(module, n)) for n in of if not n.startswith("_")]
     return [
-        n for n, x in objects if (inspect.isfunction(x) or inspect.isclass(x)) and hasattr(x, "__module__")
+        n
+        for n, x in objects
+        if (inspect.isfunction(x) or inspect.isclass(x)) and getattr(x, "__module__", "") == module.__name__
     ]
 
 

@@ -10,10 +10,10 @@ import pytest
 from factories import scene_object, turn_z
 from small_scenes import CONFIG, MARK, ROBUST, piece, scan
 
-import more2_jax.scene
 from more2_jax.config import JointConfig, MeshingConfig, preset
+from more2_jax.meshing import object_mesh
 from more2_jax.meshing.object_mesh import floor_under
-from more2_jax.registration import register as registration
+from more2_jax.registration import search, surface
 from more2_jax.scene import add_scan, reconstruct, start_scene
 from more2_jax.tracking.objects import moved_probability, points_of
 from more2_jax.types import Instance, Mesh, Scan
@@ -141,12 +141,12 @@ def test_meshes_come_in_order_whichever_is_ready_first_and_errors_come_through(
         time.sleep(waits[o.id])
         return Mesh(vertices=np.full((1, 3), waits[o.id]), faces=np.zeros((0, 3), int))
 
-    monkeypatch.setattr(more2_jax.scene, "mesh_of", slow)
+    monkeypatch.setattr(object_mesh, "mesh_of", slow)
     config = dataclasses.replace(CONFIG, joint=JointConfig(steps=0))
     bare = dataclasses.replace(scene, objects=tuple(dataclasses.replace(o, mesh=None) for o in scene.objects))
     done = reconstruct(tiny_prior, bare, config)
     assert [o.mesh.vertices[0, 0] for o in done.objects] == [waits[o.id] for o in scene.objects]
-    monkeypatch.setattr(more2_jax.scene, "mesh_of", lambda prior, o, scans, config: 1 / 0)
+    monkeypatch.setattr(object_mesh, "mesh_of", lambda prior, o, scans, config: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         reconstruct(tiny_prior, bare, config)
 
@@ -154,11 +154,9 @@ def test_meshes_come_in_order_whichever_is_ready_first_and_errors_come_through(
 def test_several_scans_confirm_one_another_one_does_not(monkeypatch, tiny_prior, scene):
     """Of what several scans saw more is an outlier, and exact points' sides reach farther."""
     asked = []
+    monkeypatch.setattr(object_mesh, "inliers", lambda p, most: asked.append(most) or np.ones(len(p), bool))
     monkeypatch.setattr(
-        more2_jax.scene, "inliers", lambda p, most: asked.append(most) or np.ones(len(p), bool)
-    )
-    monkeypatch.setattr(
-        more2_jax.scene,
+        object_mesh,
         "extract_mesh",
         lambda prior, code, meshing, *_: asked.append(meshing.screening_of_many),
     )
@@ -167,7 +165,7 @@ def test_several_scans_confirm_one_another_one_does_not(monkeypatch, tiny_prior,
         dataclasses.replace(s, accumulated=s.scan == often.reference_scan) for s in often.observations
     )
     for o in (often, dataclasses.replace(often, observations=doubted)):
-        more2_jax.scene.mesh_of(tiny_prior, o, scene.scans, ROBUST)
+        object_mesh.mesh_of(tiny_prior, o, scene.scans, ROBUST)
     assert len(often.observations) == 3
     assert asked == [ROBUST.meshing.outlier_factor_of_many, 0.3, ROBUST.meshing.outlier_factor, 0.0]
 
@@ -185,11 +183,12 @@ def test_without_steps_codes_and_poses_stay_and_with_them_they_do_not(tiny_prior
         assert (other.embedding is not before.embedding) == (len(before.observations) > 1)
 
 
-def test_another_scene_of_like_size_compiles_nothing_new(tiny_prior, scene):
-    before = registration._register_many._cache_size()
+def test_another_scene_compiles_nothing_new(tiny_prior, scene):
+    programs = (search._alignable, search._search_poses, surface._refine_poses)
+    before = [p._cache_size() for p in programs]
     other = start_scene(tiny_prior, scan("d", {0: (2.0, 0.0), 1: (0.0, 3.0), 2: (1.0, 7.0)}), CONFIG)
     add_scan(tiny_prior, other, scan("e", {0: (1.0, 1.0), 2: (0.5, 6.0)}), CONFIG)
-    assert registration._register_many._cache_size() == before
+    assert min(before) >= 1 and [p._cache_size() for p in programs] == before
 
 
 def test_one_scan_alone_is_a_scene_without_changes(tiny_prior):

@@ -29,8 +29,11 @@ def scene_config(name: str, upright: bool, path: Path | None) -> SceneConfig:
 
 
 def _replaced(base: dict[str, Any], values: Any) -> Any:
-    """`base` with `values` in place, by section; what does not fit is left for `from_dict` to name."""
-    if not isinstance(values, dict):
+    """`base` with `values` in place, by section; what does not fit is left for `from_dict` to name.
+
+    A section that names another method has settings of its own: nothing of `base` is part of it.
+    """
+    if not isinstance(values, dict) or values.get("method", base.get("method")) != base.get("method"):
         return values
     inner = {
         k: _replaced(base[k], v) if isinstance(base.get(k), dict) and v is not None else v

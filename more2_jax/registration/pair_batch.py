@@ -42,8 +42,7 @@ class PairBatch:
 
     def to_world(self, poses: jaxlie.SE3) -> Float[np.ndarray, "*batch 4 4"]:
         """Poses T_target_source between the scans' own frames, float64, from local ones: (batch,) or (batch, k)."""
-        sides = (self.target.origin, self.source.origin)
-        origins = [np.zeros((len(self), 3)) if o is None else np.asarray(o, np.float64) for o in sides]
+        origins = [host_origin(side) for side in (self.target, self.source)]
         if len(poses.wxyz_xyz.shape) == 3:
             origins = [o[:, None] for o in origins]
         return world_poses(poses, *origins)
@@ -72,6 +71,13 @@ def pair_up(
         T = np.broadcast_to(np.eye(4) if T_target_source is None else T_target_source, (sizes[0], 4, 4))
         stayed = local_poses(T, np.asarray(origins[1]), np.asarray(origins[0]))
     return PairBatch(source=source, target=target, stayed=stayed, candidates=candidates)
+
+
+def host_origin(batch: LocalBatch) -> Float[np.ndarray, "b 3"]:
+    """Where each object's local zero lies in its scan's frame; a batch without origins lies about that frame's zero."""
+    if batch.origin is None:
+        return np.zeros((len(batch.cloud.points), 3))
+    return np.asarray(batch.origin, np.float64)
 
 
 def local_batch(objects: Sequence[ObservedObject], size: int | None = None) -> LocalBatch:

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 from scipy.special import expit
 
-from more2_jax.config import preset
+from more2_jax.config import EvidenceMatcher, SurfaceSearch, preset
 from more2_jax.geometry.point_to_plane import coarsened, whole_surface
+from more2_jax.geometry.poses import vertical_shift
 from more2_jax.matching.assignment import NEVER, assign, interchangeable, unmatched
 from more2_jax.matching.calibration import (
     FREE,
@@ -23,15 +24,14 @@ from more2_jax.matching.calibration import (
     calibrated,
     log_odds,
 )
-from more2_jax.matching.candidates import fit_pairs, proposed
-from more2_jax.matching.pair_evidence import Evidence, pair_evidence
-from more2_jax.network.embedding_batch import at_zero, embed, padded, stack, with_origin
+from more2_jax.matching.candidates import align_candidates, evidence_at, odds_of, proposed
+from more2_jax.matching.pair_evidence import PairEvidence
+from more2_jax.network.embedding_batch import embed
 from more2_jax.network.prior import load_prior
-from more2_jax.registration.starting_poses import Pair
-from more2_jax.registration.surface import LIFTED, off_field, off_fields
+from more2_jax.registration.pose_costs import LIFTED, field_cost, off_field, off_fields
 from more2_jax.types import ObservedObject
 
-STILL = np.zeros((3, 3))
+FIELDS = ("of_source", "of_target", "off_source", "off_target", "lift_m")
 
 
 def box(rng, size, count=600):
@@ -67,8 +67,8 @@ def test_a_copy_that_went_makes_the_other_interchangeable_and_far_motion_alone_r
 
 def test_log_odds_are_linear_and_the_two_ways_have_no_order():
     rng = np.random.default_rng(0)
-    values = {k: rng.uniform(size=3) for k in ("of_source", "of_target", "off_source", "off_target", "lift")}
-    evidence = Evidence(radius=np.full(3, 0.5), poses=None, off_own=np.zeros(3), **values)
+    values = {k: rng.uniform(size=3) for k in FIELDS}
+    evidence = PairEvidence(radius_m=np.full(3, 0.5), off_own=np.zeros(3), **values)
     known = Compared(**{k: rng.uniform(size=3) for k in ("size", "likeness", "top_m", "color")})
     c = Calibration(
         intercept=1.0,
@@ -82,7 +82,9 @@ def test_log_odds_are_linear_and_the_two_ways_have_no_order():
         off_more=9.0,
     )
     by_hand = 1 + 4 * known.size + 5 * known.likeness + known.color
-    by_hand += 6 * np.minimum(values["lift"] / (LIFTED * 0.5), 1) + 7 * np.minimum(known.top_m / 0.5, HIGHEST)
+    by_hand += 6 * np.minimum(values["lift_m"] / (LIFTED * 0.5), 1) + 7 * np.minimum(
+        known.top_m / 0.5, HIGHEST
+    )
     for k, less, more in (("of", 2, 3), ("off", 8, 9)):
         a, b = values[f"{k}_source"], values[f"{k}_target"]
         by_hand += less * np.minimum(a, b) + more * np.maximum(a, b)
@@ -91,42 +93,47 @@ def test_log_odds_are_linear_and_the_two_ways_have_no_order():
 
 def test_the_prior_is_asked_in_any_orientation_alone_and_only_where_it_knows_the_clouds():
     rng = np.random.default_rng(0)
-    fields = ("of_source", "of_target", "off_source", "off_target", "lift")
-    evidence = Evidence(
-        radius=np.full(3, 0.5),
-        poses=None,
+    evidence = PairEvidence(
+        radius_m=np.full(3, 0.5),
         off_own=np.array([0.0, UNKNOWN, UNKNOWN + 0.1]),
-        **{k: rng.uniform(size=3) for k in fields},
+        **{k: rng.uniform(size=3) for k in FIELDS},
     )
     known = Compared(**{k: rng.uniform(size=3) for k in ("size", "likeness", "top_m", "color")})
-    upright, free = (preset("robust", upright=u).registration for u in (True, False))
+    search = SurfaceSearch()
     by = {c: log_odds(evidence, known, c) for c in (UPRIGHT, FREE, UNASKED)}
-    np.testing.assert_array_equal(calibrated(evidence, known, upright, True), by[UPRIGHT])
-    found = calibrated(evidence, known, free, False)
+    np.testing.assert_array_equal(calibrated(evidence, known, search, "upright"), by[UPRIGHT])
+    found = calibrated(evidence, known, search, "free")
     np.testing.assert_array_equal(found, [*by[FREE][:2], by[UNASKED][2]])
-    without = dataclasses.replace(free, field_weight=0.0)
-    np.testing.assert_array_equal(calibrated(evidence, known, without, False), by[UNASKED])
+    without = dataclasses.replace(search, field_weight=0.0)
+    np.testing.assert_array_equal(calibrated(evidence, known, without, "free"), by[UNASKED])
     assert not (UPRIGHT.off_less or UPRIGHT.off_more or UNASKED.off_less or UNASKED.off_more)
+
+
+def observed(prior, clouds):
+    return [ObservedObject(points=p, embedding=e) for p, e in zip(clouds, embed(prior, clouds), strict=True)]
 
 
 def test_in_any_orientation_the_evidence_is_that_of_the_best_pose(tiny_prior):
     rng = np.random.default_rng(3)
-    clouds = [box(rng, np.array([1.0, 0.5, 0.6]), 200) + [k, 0, 0] for k in range(2)]
-    cloud = padded(clouds)
-    codes = at_zero(with_origin(stack(embed(tiny_prior, clouds))[0], np.asarray(cloud.origin)))
-    flat = dataclasses.replace(cloud, origin=jnp.zeros((len(cloud.points), 3)))
-    config = dataclasses.replace(preset("robust").registration, coarse_steps=4, coarse_dense=256, cells=8)
-    offset, pairs = jnp.zeros((len(cloud.points),) * 2 + (3,)), jnp.array([[0, 1]])
-    found = pair_evidence(tiny_prior, flat, flat, codes, codes, offset, pairs, config, False)
-    T = jax.tree.map(lambda x: x[0], found.poses)
-    surfaces = [coarsened(whole_surface(cloud.points[k], cloud.mask[k]), 128, 256, 8) for k in range(2)]
-    sampled = [s.sampled for s in surfaces]
-    a, b = (jax.tree.map(lambda x, k=k: jnp.asarray(x)[k], codes) for k in range(2))
-    pair = Pair(source=sampled[0], target=sampled[1], source_code=a, target_code=b, offset=jnp.zeros(3))
-    off = off_fields(tiny_prior, T, pair, surfaces)
+    new, old = (
+        observed(tiny_prior, [box(rng, np.array([1.0, 0.5, 0.6]), 200) + [k, 0, 0]]) for k in range(2)
+    )
+    search = SurfaceSearch(steps=4, dense=256, cells=8)
+    aligned = align_candidates(tiny_prior, old, new, EvidenceMatcher(search=search), "free")
+    found = evidence_at(aligned, search, "free")
+    sides = [
+        jax.tree.map(lambda x: jnp.asarray(x[0]), dataclasses.replace(side, origin=None))
+        for side in (aligned.pairs.source, aligned.pairs.target)
+    ]
+    sampled = [coarsened(whole_surface(x.cloud.points, x.cloud.mask), 128, 256, 8).sampled for x in sides]
+    codes = [x.code for x in sides]
+    T = jax.tree.map(lambda x: x[0], aligned.found.poses)
+    off = off_fields(tiny_prior, T, tuple(sampled), tuple(codes))
     np.testing.assert_allclose([found.off_source[0], found.off_target[0]], off[0], atol=1e-3)
-    stay = jaxlie.SE3.identity()
-    own = [off_field(tiny_prior, stay, c, e) for c, e in ((sampled[0], a), (sampled[1], b))]
+    cost = jnp.asarray(aligned.found.cost[0])
+    cost += field_cost(cost, off.mean(axis=1), search.field_weight)
+    assert float(cost[0]) <= float(cost.min()) + 1e-2
+    own = [off_field(tiny_prior, jaxlie.SE3.identity(), c, e) for c, e in zip(sampled, codes, strict=True)]
     np.testing.assert_allclose(found.off_own[0], max(own), atol=1e-3)
 
 
@@ -152,20 +159,57 @@ def test_geometry_tells_boxes_of_one_size_but_different_shape_apart(tiny_prior):
     wide, tall = np.array([1.0, 0.5, 0.6]), np.array([0.5, 0.6, 1.0])  # the same box, on another face
     first = [box(rng, wide) + [5, 0, 0], box(rng, tall)]
     second = [box(rng, tall) + [2, 2, 0], box(rng, wide) + [0, 3, 0]]
-    known = [
-        [
-            ObservedObject(points=p, embedding=e)
-            for p, e in zip(clouds, embed(tiny_prior, clouds), strict=True)
-        ]
-        for clouds in (first, second)
-    ]
-    odds = fit_pairs(tiny_prior, known[0], known[1], preset("robust", upright=True)).odds
+    known = [observed(tiny_prior, clouds) for clouds in (first, second)]
+    matcher = preset("robust").matching
+    aligned = align_candidates(tiny_prior, known[0], known[1], matcher, "upright")
+    odds = odds_of(aligned, matcher.search, "upright")
     assert odds.shape == (2, 2)
     assert min(odds[0, 1], odds[1, 0]) > max(odds[0, 0], odds[1, 1]) + 1
 
 
 def test_records_of_another_encoder_are_refused_where_the_prior_has_a_say(tiny_prior):
     cloud = box(np.random.default_rng(0), np.array([1.0, 0.5, 0.6]))
-    known = [ObservedObject(points=cloud, embedding=embed(tiny_prior, [cloud])[0])]
+    known = observed(tiny_prior, [cloud])
     with pytest.raises(ValueError, match=r"match got embeddings with 0 levels of anchors.*needed 2"):
-        fit_pairs(load_prior("small"), known, known, preset("robust"))
+        align_candidates(load_prior("small"), known, known, EvidenceMatcher(), "free")
+
+
+# --- heights ----------------------------------------------------------------------------------------------------
+
+ROOM = [np.array(size) for size in ([1.0, 0.5, 0.6], [0.5, 0.6, 1.0], [1.4, 0.4, 0.3])]
+
+
+@pytest.fixture(scope="module")
+def lifted_room(tiny_prior):
+    """Three boxes, and the same again somewhere else, 6 cm lower."""
+    rng = np.random.default_rng(4)
+    first = [box(rng, size) + [3.0 * k, 0, 0] for k, size in enumerate(ROOM)]
+    second = [box(rng, size) + [3.0 * k, 1.0, -0.06] for k, size in enumerate(ROOM)]
+    return observed(tiny_prior, first), observed(tiny_prior, second)
+
+
+@pytest.mark.parametrize("height_m", [0.06, -0.03])
+def test_a_height_weighed_afterwards_is_that_height_searched_at(tiny_prior, lifted_room, height_m):
+    matcher = preset("robust").matching
+    below = align_candidates(tiny_prior, *lifted_room, matcher, "upright")
+    there = align_candidates(tiny_prior, *lifted_room, matcher, "upright", vertical_shift(height_m))
+    weighed = odds_of(below, matcher.search, "upright", height_m)
+    searched = odds_of(there, matcher.search, "upright", height_m)
+    np.testing.assert_array_equal(weighed > 0, searched > 0)
+    np.testing.assert_allclose(weighed, searched, atol=0.3)
+    assert np.abs(weighed - odds_of(below, matcher.search, "upright", 0.0)).max() > 0.3
+
+
+def test_pairs_are_listed_row_by_row_and_taken_with_the_poses_found(tiny_prior, lifted_room):
+    old, new = lifted_room
+    matcher = EvidenceMatcher(candidates=1)
+    aligned = align_candidates(tiny_prior, old, new, matcher, "upright")
+    listed = [tuple(pair) for pair in np.argwhere(aligned.among)]
+    assert [aligned.row_of(k, i) for k, i in listed] == list(range(len(listed)))
+    chosen = listed[::-1]
+    taken = aligned.take(chosen)
+    origins = [[o.points.mean(axis=0) for o in side] for side in (new, old)]
+    np.testing.assert_allclose(taken.source.origin, [origins[0][i] for _, i in chosen], atol=1e-9)
+    np.testing.assert_allclose(taken.target.origin, [origins[1][k] for k, _ in chosen], atol=1e-9)
+    np.testing.assert_allclose(taken.to_world(taken.candidates), aligned.T_old_new[::-1], atol=1e-9)
+    np.testing.assert_array_equal(taken.prepared[0].radius, aligned.objects[0].radius[::-1])

@@ -9,7 +9,7 @@ import pytest
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial.transform import Rotation
 
-from more2_jax.config import MatchingConfig
+from more2_jax.config import CodeMatcher
 from more2_jax.matching.code_assignment import (
     SMALLEST_ERROR,
     cosine,
@@ -135,7 +135,7 @@ def test_greedy_and_hungarian_differ_where_the_best_pair_is_not_in_the_best_tota
 @pytest.mark.parametrize("kind", ["inv", "eqv", "both"])
 def test_score_is_cosine_over_the_error_after_the_best_rotation(kind):
     source, target = codes(3, 5), codes(4, 6)
-    got = np.asarray(score_matrix(source, target, MatchingConfig(score=kind)))
+    got = np.asarray(score_matrix(source, target, CodeMatcher(score=kind)))
     for k in range(5):
         for i in range(6):
             a, b = (np.asarray(x, np.float64) for x in (source.inv[k], target.inv[i]))
@@ -152,20 +152,12 @@ def test_a_turned_moved_object_scores_highest_possible_with_itself():
     turn = jnp.asarray(Rotation.random(random_state=1).as_matrix(), jnp.float32)
     moved = dataclasses.replace(e, eqv=turn @ e.eqv, center=e.center + 5.0)
     assert float(turning_error(e.eqv, moved.eqv)) < SMALLEST_ERROR
-    assert float(pair_score(e, moved, MatchingConfig())) == pytest.approx(1 / SMALLEST_ERROR, rel=1e-5)
+    assert float(pair_score(e, moved, CodeMatcher())) == pytest.approx(1 / SMALLEST_ERROR, rel=1e-5)
 
 
 def test_a_mirrored_object_is_not_the_same_object():
     e = one(codes(5, 1))
     assert float(turning_error(e.eqv, e.eqv * jnp.array([[-1.0], [1], [1]]))) > 0.1
-
-
-def test_size_weight_takes_off_the_log_of_the_ratio():
-    e = one(codes(6, 1))
-    twice = dataclasses.replace(e, scale=2 * e.scale)
-    config = MatchingConfig(score="inv", size_weight=0.5)
-    assert float(pair_score(e, twice, config)) == pytest.approx(1 - 0.5 * np.log(2), rel=1e-5)
-    assert float(pair_score(twice, e, config)) == pytest.approx(1 - 0.5 * np.log(2), rel=1e-5)
 
 
 def test_a_zero_code_is_like_nothing():
@@ -182,7 +174,7 @@ def test_score_has_finite_gradients_everywhere(kind, case):
         a = dataclasses.replace(a, inv=0 * a.inv, eqv=0 * a.eqv)
     if case == "line":
         a = dataclasses.replace(a, eqv=a.eqv * jnp.array([[1.0], [0], [0]]))
-    config = MatchingConfig(score=kind, size_weight=0.5)
+    config = CodeMatcher(score=kind)
     gradient = jax.grad(lambda x, y: pair_score(x, y, config), argnums=(0, 1))(a, b)
     assert all(bool(jnp.isfinite(g).all()) for g in jax.tree.leaves(gradient))
 
@@ -193,8 +185,8 @@ def test_score_has_finite_gradients_everywhere(kind, case):
 def test_permuting_the_targets_permutes_the_matching():
     source, target = codes(9, 5), codes(10, 7)
     order = np.random.default_rng(0).permutation(7)
-    plain = match_instances(source, target, MatchingConfig())
-    mixed = match_instances(source, rows(target, order), MatchingConfig())
+    plain = match_instances(source, target, CodeMatcher())
+    mixed = match_instances(source, rows(target, order), CodeMatcher())
     np.testing.assert_array_equal(order[np.asarray(mixed.target_index)], plain.target_index)
     np.testing.assert_allclose(mixed.score, plain.score, rtol=1e-5)
 
@@ -202,7 +194,7 @@ def test_permuting_the_targets_permutes_the_matching():
 @pytest.mark.parametrize("assignment", ["hungarian", "greedy"])
 @pytest.mark.parametrize(("n", "m"), [(0, 0), (0, 3), (3, 0), (1, 1), (1, 4), (4, 1)])
 def test_any_number_of_objects_on_either_side(n, m, assignment):
-    config = MatchingConfig(assignment=assignment)
+    config = CodeMatcher(assignment=assignment)
     matches = match_instances(codes(11, n), codes(12, m), config)
     assert matches.target_index.shape == matches.score.shape == (n,)
     assert int((matches.target_index >= 0).sum()) == min(n, m)
@@ -212,27 +204,17 @@ def test_any_number_of_objects_on_either_side(n, m, assignment):
 def test_rows_of_padding_take_no_part():
     source, target = codes(13, 6), codes(14, 8)
     real, other = np.arange(6) < 4, np.arange(8) < 3
-    alone = match_instances(rows(source, range(4)), rows(target, range(3)), MatchingConfig())
+    alone = match_instances(rows(source, range(4)), rows(target, range(3)), CodeMatcher())
     for junk in (np.nan, np.inf, 1e20):
         dirty = jax.tree.map(lambda x, j=junk: x.at[4:].set(j), source)
         filth = jax.tree.map(lambda x, j=junk: x.at[3:].set(j), target)
-        matches = match_instances(dirty, filth, MatchingConfig(), real, other)
+        matches = match_instances(dirty, filth, CodeMatcher(), real, other)
         np.testing.assert_array_equal(matches.target_index, [*alone.target_index, -1, -1])
         np.testing.assert_allclose(matches.score[:4], alone.score, rtol=1e-5)
 
 
-def test_objects_of_other_sizes_are_no_partners():
-    source = codes(15, 1)
-    target = rows(source, [0, 0])
-    target = dataclasses.replace(target, scale=source.scale * jnp.array([1.9, 1.7]))
-    config = MatchingConfig(score="inv", max_size_ratio=1.8)
-    assert match_instances(source, target, config).target_index.tolist() == [1]
-    assert match_instances(source, rows(target, [0]), config).target_index.tolist() == [-1]
-    assert match_instances(rows(target, [0]), source, config).target_index.tolist() == [-1]
-
-
 def test_a_bonus_decides_among_identical_objects():
-    source, config = rows(codes(16, 1), [0, 0]), MatchingConfig(score="inv")
+    source, config = rows(codes(16, 1), [0, 0]), CodeMatcher(score="inv")
     for bonus, expected in (([[0, -1], [-1, 0]], [0, 1]), ([[-1, 0], [0, -1]], [1, 0])):
         matches = match_instances(source, source, config, bonus=np.array(bonus, np.float32))
         assert matches.target_index.tolist() == expected
@@ -241,12 +223,12 @@ def test_a_bonus_decides_among_identical_objects():
 
 def test_a_bonus_of_another_shape_is_refused(unchecked):
     with pytest.raises(ValueError, match=r"shape \(2, 2\); needed \(2, 3\)"):
-        match_instances(codes(0, 2), codes(1, 3), MatchingConfig(), bonus=np.zeros((2, 2), np.float32))
+        match_instances(codes(0, 2), codes(1, 3), CodeMatcher(), bonus=np.zeros((2, 2), np.float32))
 
 
 def test_an_object_a_kilometer_away_matches_as_well():
     source, target = codes(9, 5), codes(10, 7)
     far = dataclasses.replace(target, origin=target.origin + 1000.0)
-    plain, moved = (match_instances(source, t, MatchingConfig()) for t in (target, far))
+    plain, moved = (match_instances(source, t, CodeMatcher()) for t in (target, far))
     np.testing.assert_array_equal(plain.target_index, moved.target_index)
     np.testing.assert_array_equal(plain.score, moved.score)

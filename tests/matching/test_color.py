@@ -10,24 +10,21 @@ import numpy as np
 import pytest
 from factories import turn_z
 from places import ROOT
+from small_scenes import CONFIG
 
-from more2_jax.config import preset
-from more2_jax.geometry.transform import moved
+from more2_jax.geometry.transform import transform
 from more2_jax.matching.color import DIFFERENT, ODD, SAME, color_evidence, color_of, pooled
 from more2_jax.network.embedding_batch import embed
 from more2_jax.scans.read_scan import read_scan
 from more2_jax.scene import add_scan, start_scene
 from more2_jax.storage.scene_folder import load_scene, save_scene
-from more2_jax.tracking.identify import last_seen, match_scan
+from more2_jax.tracking.identify import identify
 from more2_jax.tracking.objects import new_object, seen_again
-from more2_jax.types import Color, Instance, Scan
+from more2_jax.tracking.relocalize import known_object
+from more2_jax.types import Color, Instance, ObservedObject, Scan
 
 RED, BLUE, GRAY = (190, 60, 50), (60, 80, 170), (128, 128, 128)
 HERE, THERE = 0.0, 3.0
-ROBUST = preset("robust", upright=True)
-CONFIG = dataclasses.replace(
-    ROBUST, registration=dataclasses.replace(ROBUST.registration, yaw_starts=8, keep_starts=2)
-)
 
 
 def shape() -> np.ndarray:
@@ -59,7 +56,11 @@ def identified(prior, first: Scan, second: Scan):
     """Who is who in the second scan."""
     codes = [embed(prior, [i.points for i in s.instances]) for s in (first, second)]
     objects = [new_object(k, 0, i, e) for k, (i, e) in enumerate(zip(first.instances, codes[0], strict=True))]
-    return match_scan(prior, objects, second.instances, codes[1], CONFIG)
+    new = [
+        ObservedObject(points=i.points, embedding=e, color=color_of(i.colors))
+        for i, e in zip(second.instances, codes[1], strict=True)
+    ]
+    return identify(prior, [known_object(o, None, CONFIG)[0] for o in objects], new, CONFIG)
 
 
 def partners(result) -> list[tuple[int, int, bool]]:
@@ -118,8 +119,9 @@ def test_an_object_gains_the_colors_of_accumulated_observations(tiny_prior):
     np.testing.assert_allclose(
         both.color.lab, color_of(np.concatenate([first.colors, second.colors])).lab, rtol=1e-12
     )
-    assert last_seen(both)[0].color is both.color
-    assert moved(last_seen(both)[0], turn_z(1.0, np.zeros(3), np.ones(3))).color is both.color
+    known, _ = known_object(both, None, CONFIG)
+    assert known.color is both.color
+    assert transform(known, turn_z(1.0, np.zeros(3), np.ones(3))).color is both.color
     assert seen_again(o, second, dataclasses.replace(again, accumulated=False)).color is o.color
     assert seen_again(o, dataclasses.replace(second, colors=None), again).color.points == 640
 

@@ -14,15 +14,12 @@ from scipy.spatial.transform import Rotation
 from more2_jax.config import preset
 from more2_jax.geometry.padding import pad_clouds
 from more2_jax.geometry.point_to_plane import thinned, whole_surface
-from more2_jax.geometry.points import Sampled
 from more2_jax.network.prior import encode, load_prior, sdf_one
-from more2_jax.registration import surface as surface_registration
-from more2_jax.registration.starting_poses import Pair
-from more2_jax.registration.surface import ABOUT_AS_WELL, OFF_FIELD, doubts
+from more2_jax.registration import pose_costs
+from more2_jax.registration.pose_costs import ABOUT_AS_WELL, OFF_FIELD, field_cost
 
 POINTS, COUNT = 512, 64
-CONFIG = preset("robust", upright=True).registration
-off_both_ways = quick_jit(surface_registration.off_fields)
+off_both_ways = quick_jit(pose_costs.off_fields)
 surface_of = quick_jit(whole_surface)
 
 
@@ -32,20 +29,13 @@ def prior():
 
 
 def pair_of(prior, source, target):
-    """Two clouds in one frame, about a common zero; and both as surfaces."""
+    """Two clouds in one frame, about a common zero, as surfaces; and their codes."""
     cloud = pad_clouds([source, target], POINTS)
     zero = np.asarray(cloud.origin).mean(axis=0)
     points = np.asarray(cloud.points) + (np.asarray(cloud.origin) - zero)[:, None]
-    cloud = dataclasses.replace(cloud, points=jnp.asarray(points, jnp.float32), origin=np.zeros((2, 3)))
-    codes = [jax.tree.map(lambda x, k=k: jnp.asarray(x[k]), encode(prior, cloud)) for k in range(2)]
-    clouds = [
-        Sampled(points=p, mask=m, dense=p, dense_mask=m)
-        for p, m in zip(cloud.points, cloud.mask, strict=True)
-    ]
-    pair = Pair(
-        source=clouds[0], target=clouds[1], source_code=codes[0], target_code=codes[1], offset=jnp.zeros(3)
-    )
-    return pair, [surface_of(c.points, c.mask) for c in clouds]
+    cloud = dataclasses.replace(cloud, points=jnp.asarray(points, jnp.float32), origin=None)
+    codes = [jax.tree.map(lambda x, k=k: x[k], encode(prior, cloud)) for k in range(2)]
+    return [surface_of(p, m) for p, m in zip(cloud.points, cloud.mask, strict=True)], codes
 
 
 def poses_of(*matrices):
@@ -54,9 +44,10 @@ def poses_of(*matrices):
     )
 
 
-def off_fields(prior, poses, pair, surfaces, count):
+def off_fields(prior, poses, surfaces, codes, count):
     """The mean of both ways."""
-    return off_both_ways(prior, poses, pair, [thinned(s, count) for s in surfaces]).mean(axis=1)
+    clouds = tuple(thinned(s, count).sampled for s in surfaces)
+    return off_both_ways(prior, poses, clouds, tuple(codes)).mean(axis=1)
 
 
 @pytest.fixture(scope="module")
@@ -66,14 +57,11 @@ def example(prior):
 
 
 def test_it_is_the_mean_of_both_truncated_distances(prior, example):
-    pair, surfaces = example
+    (source, target), codes = example
     T = pieces.pose(Rotation.from_euler("z", 20, degrees=True), np.array([0.05, 0.0, 0.02]))
-    found = off_fields(prior, poses_of(T), pair, surfaces, POINTS)
+    found = off_fields(prior, poses_of(T), *example, POINTS)
     shares = []
-    for cloud, code, M in (
-        (pair.source, pair.target_code, T),
-        (pair.target, pair.source_code, np.linalg.inv(T)),
-    ):
+    for cloud, code, M in ((source.sampled, codes[1], T), (target.sampled, codes[0], np.linalg.inv(T))):
         points = pieces.apply(M, np.asarray(cloud.points)[np.asarray(cloud.mask)])
         distance = np.abs(sdf_one(prior, code, jnp.asarray(points, jnp.float32)))
         shares.append(np.minimum(distance / OFF_FIELD, 1).mean())
@@ -89,9 +77,9 @@ def test_it_is_least_where_the_two_belong_and_1_far_away_or_nowhere(prior, examp
 
 
 def test_moving_the_target_moves_the_pose_alone(prior, example):
-    pair, _ = example
+    surfaces, _ = example
     M = pieces.pose(Rotation.random(random_state=2), np.array([0.3, -0.2, 0.1]))
-    source, target = (np.asarray(c.points)[np.asarray(c.mask)] for c in (pair.source, pair.target))
+    source, target = (np.asarray(x.sampled.points)[np.asarray(x.sampled.mask)] for x in surfaces)
     moved = pair_of(prior, source, pieces.apply(M, target))
     # `pair_of` takes its zero between both clouds, so that of the source's frame moves, too.
     zero = (source.mean(axis=0) + pieces.apply(M, target).mean(axis=0)) / 2
@@ -102,25 +90,19 @@ def test_moving_the_target_moves_the_pose_alone(prior, example):
 
 
 def test_each_way_is_that_of_the_other_cloud(prior, example):
-    pair, surfaces = example
+    surfaces, codes = example
+    clouds = tuple(x.sampled for x in surfaces)
     T = pieces.pose(Rotation.from_euler("z", 20, degrees=True), np.array([0.05, 0.0, 0.02]))
-    swapped = dataclasses.replace(
-        pair,
-        source=pair.target,
-        target=pair.source,
-        source_code=pair.target_code,
-        target_code=pair.source_code,
-    )
-    there = off_both_ways(prior, poses_of(T), pair, surfaces)
-    back = off_both_ways(prior, poses_of(np.linalg.inv(T)), swapped, surfaces[::-1])
+    there = off_both_ways(prior, poses_of(T), clouds, tuple(codes))
+    back = off_both_ways(prior, poses_of(np.linalg.inv(T)), clouds[::-1], tuple(codes[::-1]))
     np.testing.assert_allclose(there[0], back[0, ::-1], atol=1e-5)
     assert abs(there[0, 0] - there[0, 1]) > 1e-3
 
 
 def test_it_chooses_among_poses_that_fit_about_as_well_and_no_others():
     costs = jnp.array([0.2, 0.2 + 0.9 * ABOUT_AS_WELL, 0.2 + 1.1 * ABOUT_AS_WELL])
-    np.testing.assert_allclose(doubts(costs, jnp.array([0.3, 0.1, 0.0]), 2.0), [0.6, 0.2, 2.0])
+    np.testing.assert_allclose(field_cost(costs, jnp.array([0.3, 0.1, 0.0]), 2.0), [0.6, 0.2, 2.0])
 
 
-def test_only_robust_asks_for_it():
-    assert preset("paper").registration.field_weight == 0 < CONFIG.field_weight
+def test_robust_asks_for_it():
+    assert preset("robust").registration.search.field_weight > 0

@@ -13,8 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from more2_jax.config import JointConfig
 from more2_jax.geometry.padding import pad_clouds
-from more2_jax.geometry.transform import move_embedding, scale_embedding
-from more2_jax.network.embedding_batch import at_zero
+from more2_jax.geometry.transform import rescale, transform
 from more2_jax.network.prior import encode
 from more2_jax.refinement import joint
 from more2_jax.refinement.joint import Observations, departure, fit_jointly, surface_loss
@@ -52,7 +51,7 @@ def seen(tiny_prior):
             T[:3, 3] += 0.02 * rng.normal(size=3) * (j > 0)
             poses.append(np.asarray(pose_group(T).wxyz_xyz))
     batch = pad_clouds(clouds, 256)
-    codes = at_zero(encode(tiny_prior, batch))
+    codes = dataclasses.replace(encode(tiny_prior, batch), origin=None)
     real = jnp.arange(SEEN)[None].repeat(OBJECTS, axis=0) < SEEN - 1
 
     def split(x):
@@ -90,11 +89,11 @@ def test_no_step_is_the_loss_of_the_start_by_definition(tiny_prior, seen, start)
     for n in range(OBJECTS):
         one = joint.thin(jax.tree.map(lambda x, n=n: x[n], seen), POINTS)
         radius = joint.cloud_radius(one.points[0], one.mask[0])
-        one = joint.rescale(one, 1 / radius)
+        one = rescale(one, 1 / radius)
         starts = [one.accumulated]
         if start == "best":
             own = [jax.tree.map(lambda x, j=j: x[j], (one.codes, one.T_ref_obs)) for j in range(SEEN - 1)]
-            starts = [move_embedding(code, T) for code, T in own]
+            starts = [transform(code, T) for code, T in own]
         losses = [float(loss_of(tiny_prior, code, one.T_ref_obs, one)) for code in starts]
         assert min(abs(float(fit.loss[n]) - loss) for loss in losses) < 1e-4 * max(losses)
 
@@ -109,7 +108,7 @@ def test_without_a_step_size_nothing_moves(seen, unmoved):
     codes = unmoved.embedding
     for n in range(OBJECTS):  # X*: the code of one of the observations, in the reference's frame
         moved = [
-            move_embedding(*jax.tree.map(lambda x, n=n, j=j: x[n, j], (seen.codes, seen.T_ref_obs)))
+            transform(*jax.tree.map(lambda x, n=n, j=j: x[n, j], (seen.codes, seen.T_ref_obs)))
             for j in range(SEEN - 1)
         ]
         gaps = [
@@ -169,8 +168,8 @@ def test_moving_the_code_is_encoding_what_was_moved(tiny_prior, factor):
     moved = pieces.apply(T, factor * cloud)
     batch = pad_clouds([cloud, moved], 256)
     before, after = (jax.tree.map(lambda x, k=k: x[k], encode(tiny_prior, batch)) for k in (0, 1))
-    plain = dataclasses.replace(before, center=before.center + before.origin.astype(np.float32))
-    expected = move_embedding(scale_embedding(plain, jnp.float32(factor)), pose_group(T))
+    plain = dataclasses.replace(before, center=before.center + before.origin.astype(np.float32), origin=None)
+    expected = transform(rescale(plain, jnp.float32(factor)), pose_group(T))
     np.testing.assert_allclose(after.inv, expected.inv, atol=1e-4)
     np.testing.assert_allclose(after.eqv, expected.eqv, atol=1e-4)
     assert float(after.scale) == pytest.approx(float(expected.scale), rel=1e-4)

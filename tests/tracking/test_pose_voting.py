@@ -18,28 +18,29 @@ from more2_jax.tracking.pose_voting import (
 EYE = np.eye(4)
 
 
-def pose(rng, upright=True, far=20.0):
-    turn = Rotation.from_euler("z", rng.uniform(-np.pi, np.pi)) if upright else Rotation.random(None, rng)
+def pose(rng, motion="upright", far=20.0):
+    yaw = motion == "upright"
+    turn = Rotation.from_euler("z", rng.uniform(-np.pi, np.pi)) if yaw else Rotation.random(None, rng)
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = turn.as_matrix(), rng.uniform(-far, far, 3)
     return T
 
 
-def noisy(T, center, rng, sigma_m, sigma_deg, upright):
+def noisy(T, center, rng, sigma_m, sigma_deg, motion):
     """`T` with an error of place at `center` and of direction."""
     error = np.eye(4)
-    turn = rng.normal(0, np.deg2rad(sigma_deg), 3) * ([0, 0, 1] if upright else [1, 1, 1])
+    turn = rng.normal(0, np.deg2rad(sigma_deg), 3) * ([0, 0, 1] if motion == "upright" else [1, 1, 1])
     error[:3, :3] = Rotation.from_rotvec(turn).as_matrix()
     at = apply_pose(T, center[None])[0]
     error[:3, 3] = at + rng.normal(0, sigma_m, 3) - error[:3, :3] @ at
     return error @ T
 
 
-def votes_for(T, rng, stayed, moved, upright=True, sigma_m=0.01, sigma_deg=0.5):
+def votes_for(T, rng, stayed, moved, motion="upright", sigma_m=0.01, sigma_deg=0.5):
     """`stayed` pairs that say `T`, and a wrong way each; `moved` that say anything."""
     center = rng.uniform(-3, 3, (stayed + moved, 3))
-    ways = [[noisy(T, c, rng, sigma_m, sigma_deg, upright), pose(rng, upright)] for c in center[:stayed]]
-    ways += [[pose(rng, upright), pose(rng, upright)] for _ in range(moved)]
+    ways = [[noisy(T, c, rng, sigma_m, sigma_deg, motion), pose(rng, motion)] for c in center[:stayed]]
+    ways += [[pose(rng, motion), pose(rng, motion)] for _ in range(moved)]
     every = np.arange(stayed + moved)
     return Votes(T_scene_scan=np.array(ways), center=center, object=every, instance=every)
 
@@ -48,13 +49,13 @@ def off(found, T, votes):
     return np.linalg.norm(apply_pose(found, votes.center) - apply_pose(T, votes.center), axis=1).max()
 
 
-@pytest.mark.parametrize("upright", [True, False])
+@pytest.mark.parametrize("motion", ["upright", "free"])
 @pytest.mark.parametrize("seed", range(4))
-def test_what_stayed_outvotes_what_moved(upright, seed):
+def test_what_stayed_outvotes_what_moved(motion, seed):
     rng = np.random.default_rng(seed)
-    T = pose(rng, upright)
-    votes = votes_for(T, rng, stayed=4, moved=5, upright=upright)
-    found = most_agreed(votes, upright, EYE)
+    T = pose(rng, motion)
+    votes = votes_for(T, rng, stayed=4, moved=5, motion=motion)
+    found = most_agreed(votes, motion, EYE)
     assert off(found, T, votes) < 0.04
     assert rotation_error_deg(found[:3, :3], T[:3, :3]) < 1.5
 
@@ -63,9 +64,9 @@ def test_the_frame_given_is_kept_to_the_last_bit_without_need():
     rng = np.random.default_rng(0)
     for stayed, moved in ((0, 8), (2, 0), (3, 3), (0, 0)):  # in the frame given
         votes = votes_for(EYE, rng, stayed, moved)
-        np.testing.assert_array_equal(most_agreed(votes, True, EYE), EYE)
+        np.testing.assert_array_equal(most_agreed(votes, "upright", EYE), EYE)
     few = votes_for(pose(rng), rng, 2, 4)  # two things put elsewhere together
-    np.testing.assert_array_equal(most_agreed(few, True, EYE), EYE)
+    np.testing.assert_array_equal(most_agreed(few, "upright", EYE), EYE)
     together, still = votes_for(pose(rng), rng, 3, 0), votes_for(EYE, rng, 2, 0)  # three of five
     both = Votes(
         T_scene_scan=np.concatenate([together.T_scene_scan, still.T_scene_scan]),
@@ -73,7 +74,7 @@ def test_the_frame_given_is_kept_to_the_last_bit_without_need():
         object=np.arange(5),
         instance=np.arange(5),
     )
-    np.testing.assert_array_equal(most_agreed(both, True, EYE), EYE)
+    np.testing.assert_array_equal(most_agreed(both, "upright", EYE), EYE)
 
 
 def test_one_object_has_one_voice_however_many_instances_are_like_it():
@@ -102,20 +103,20 @@ def test_symmetric_objects_agree_by_their_place_alone():
         about[:3, 3] = c - about[:3, :3] @ c
         ways.append([T @ about])
     votes = Votes(T_scene_scan=np.array(ways), center=center, object=np.arange(4), instance=np.arange(4))
-    found = estimate(noisy(T, center.mean(0), rng, 0.01, 0.5, True), votes, True)
+    found = estimate(noisy(T, center.mean(0), rng, 0.01, 0.5, "upright"), votes, "upright")
     assert found.agreeing == 4
     np.testing.assert_allclose(found.T_scene_scan, T, atol=1e-6)
 
 
-@pytest.mark.parametrize("upright", [True, False])
-def test_the_best_motion_of_exact_votes_is_exact_and_keeps_upright(upright):
+@pytest.mark.parametrize("motion", ["upright", "free"])
+def test_the_best_motion_of_exact_votes_is_exact_and_keeps_upright(motion):
     rng = np.random.default_rng(3)
-    T = pose(rng, upright)
-    votes = votes_for(T, rng, 3, 0, upright, 0.0, 0.0)
+    T = pose(rng, motion)
+    votes = votes_for(T, rng, 3, 0, motion, 0.0, 0.0)
     ways, alike = votes.T_scene_scan[:, 0], np.ones(3, bool)
-    found = best_motion(ways, votes.center, np.ones(3), alike, upright)
+    found = best_motion(ways, votes.center, np.ones(3), alike, motion)
     np.testing.assert_allclose(found, T, atol=1e-9)
-    alone = best_motion(ways[:1], votes.center[:1], np.ones(1), alike[:1], upright)  # by its turn
+    alone = best_motion(ways[:1], votes.center[:1], np.ones(1), alike[:1], motion)  # by its turn
     np.testing.assert_allclose(alone, T, atol=1e-9)
 
 
@@ -125,7 +126,7 @@ def test_errors_of_the_frame_are_about_as_large_as_they_are_said_to_be():
         rng = np.random.default_rng(seed)
         T = pose(rng)
         votes = votes_for(T, rng, 6, 2, sigma_m=0.01, sigma_deg=1.5)
-        found = estimate(T, votes, True)
+        found = estimate(T, votes, "upright")
         ratios.append(off(found.T_scene_scan, T, votes) / position_sigma(found, apply_pose(T, votes.center)))
     assert 0.4 < np.sqrt(np.mean(np.square(ratios))) < 2.0
 

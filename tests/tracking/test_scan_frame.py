@@ -10,13 +10,11 @@ from factories import turn_z
 from small_scenes import CONFIG, piece, scan
 
 from more2_jax.geometry.floor import floor_height
-from more2_jax.geometry.poses import apply_pose
-from more2_jax.geometry.transform import lift, moved, moved_embedding
+from more2_jax.geometry.poses import apply_pose, vertical_shift
 from more2_jax.network.embedding_batch import embed
 from more2_jax.scene import add_scan, start_scene
 from more2_jax.tracking.objects import motion_between
-from more2_jax.tracking.scan_frame import Rooms
-from more2_jax.tracking.scan_height import best_vote, common_height, doubtful
+from more2_jax.tracking.scan_height import Rooms, best_vote, common_height, doubtful
 from more2_jax.types import Instance, LivingScene, ObservedObject, Scan
 
 FIRST = {0: (0.0, 0.0), 1: (0.3, 3.0), 2: (0.0, 6.0)}
@@ -63,7 +61,7 @@ def same_but_for(T_own_scene: np.ndarray, scene: LivingScene, together: LivingSc
 @pytest.mark.parametrize("height_m", [1.0, *(pytest.param(h, marks=pytest.mark.slow) for h in (-0.4, 0.05))])
 def test_a_lifted_scan_is_matched_as_if_it_were_not(tiny_prior, together, height_m):
     assert together.changes[0].moved == ("object_001",)
-    T = lift(height_m)
+    T = vertical_shift(height_m)
     same_but_for(T, visited(tiny_prior, in_frame(scan("b", THEN), T)), together, atol=5e-3)
 
 
@@ -115,16 +113,16 @@ def test_one_object_put_on_a_table_does_not_lift_the_room(tiny_prior):
 
 def test_floors_propose_a_height_where_the_objects_do_not_agree(tiny_prior):
     """Nothing is common but one box and the floor: 1 m is found although no two pairs vote for it."""
-    config = dataclasses.replace(CONFIG, min_points=1)
     points = scan("a", {0: (0.0, 0.0)}).instances[0].points
     clouds = [points, points + [0.0, 0.0, 1.0]]
     old, new = (
         [ObservedObject(points=c, embedding=e)]
         for c, e in zip(clouds, embed(tiny_prior, clouds), strict=True)
     )
-    height, fits = common_height(tiny_prior, old, new, config, Rooms(scene=room(0.0, 0), scan=room(1.0, 1)))
-    assert height == pytest.approx(-1.0, abs=0.01)
-    assert fits.odds[0, 0] > 0
+    rooms = Rooms(scene=room(0.0, 0), scan=room(1.0, 1))
+    weighed = common_height(tiny_prior, old, new, CONFIG.matching, rooms)
+    assert weighed.height_m == pytest.approx(-1.0, abs=0.01)
+    assert weighed.odds[0, 0] > 0
 
 
 def test_the_floor_is_the_lowest_full_layer():
@@ -141,17 +139,6 @@ def test_votes_for_a_height_are_counted_near_one_another():
     assert doubtful(votes, weights)
     assert not doubtful(np.array([0.5, 0.0, 3.0]), np.ones(3))  # none agree: as they are
     assert not doubtful(np.array([0.004, -0.004, 0.5]), np.ones(3))
-
-
-def test_a_moved_embedding_is_that_of_the_moved_cloud(tiny_prior):
-    points = scan("a", {1: (0.0, 0.0)}).instances[0].points
-    T = lift(3.0)
-    T[:2, :2] = [[0.0, -1.0], [1.0, 0.0]]
-    before, after = embed(tiny_prior, [points, apply_pose(T, points)])
-    found = moved_embedding(before, T)
-    np.testing.assert_allclose(found.eqv, after.eqv, atol=1e-3)
-    np.testing.assert_allclose(found.center + found.origin, after.center + after.origin, atol=1e-3)
-    assert moved(ObservedObject(points=points, embedding=before), np.eye(4)).points is points
 
 
 def test_a_stray_point_far_away_changes_no_floor():

@@ -1,0 +1,123 @@
+"""Nothing is searched twice: matching aligns every candidate pair once, registration refines what was found."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from small_scenes import CONFIG, scan
+
+from more2_jax.config import preset
+from more2_jax.matching import candidates
+from more2_jax.network.embedding_batch import embed
+from more2_jax.registration import search, surface
+from more2_jax.scene import add_scan, compared_objects, start_scene
+from more2_jax.tracking import relocalize
+from more2_jax.tracking.identify import identify
+from more2_jax.types import Frame
+
+FIRST = {0: (0.0, 0.0), 1: (0.3, 3.0), 2: (0.0, 6.0)}
+THEN = {0: (0.0, 0.0), 1: (1.2, 4.0), 2: (0.0, 6.0)}
+ONE_PARTNER = dataclasses.replace(CONFIG, matching=dataclasses.replace(CONFIG.matching, candidates=1))
+
+
+@pytest.fixture
+def searched(monkeypatch):
+    """The pairs of every search: where source and target lie, and what asked for them."""
+    asked = []
+
+    def watch(module, name):
+        original = module.search_poses
+
+        def search_poses(source, target, stayed, *settings):
+            asked.append((name, len(source.radius)))
+            return original(source, target, stayed, *settings)
+
+        monkeypatch.setattr(module, "search_poses", search_poses)
+
+    watch(candidates, "matching")
+    watch(surface, "registration")
+    return asked
+
+
+@pytest.fixture
+def refined(monkeypatch):
+    """How many pairs each call of registration refined."""
+    counts = []
+    original = surface.refine_poses
+
+    def refine_poses(prior, objects, poses, *rest):
+        counts.append(poses.wxyz_xyz.shape[:2])
+        return original(prior, objects, poses, *rest)
+
+    monkeypatch.setattr(surface, "refine_poses", refine_poses)
+    return counts
+
+
+@pytest.fixture(scope="module")
+def first(tiny_prior):
+    return start_scene(tiny_prior, scan("a", FIRST), CONFIG)
+
+
+@pytest.mark.parametrize("config", [CONFIG, ONE_PARTNER], ids=["all pairs", "one partner each"])
+def test_every_candidate_pair_is_searched_once_and_registration_searches_nothing(
+    tiny_prior, first, searched, refined, config
+):
+    second = scan("b", THEN)
+    codes = embed(tiny_prior, [i.points for i in second.instances])
+    old, new = compared_objects(first, second.instances, codes, second, config)
+    known = [o for o, _ in old]
+    among = candidates.proposed(
+        candidates.proposal_of(candidates.compared(known, new), config.matching), config.matching.candidates
+    )
+    made = add_scan(tiny_prior, first, second, config)
+    assert searched == [("matching", int(among.sum()))]
+    found = sum(len(o.observations) == 2 for o in made.objects)
+    assert found > 0 and refined == [(found, config.matching.search.keep)]
+
+
+def test_a_scan_whose_frame_settles_elsewhere_is_refined_again_but_not_searched(
+    tiny_prior, first, searched, refined, monkeypatch
+):
+    T = np.eye(4)
+    T[:3, 3] = [0.0, 0.0, 0.01]
+    monkeypatch.setattr(relocalize, "settled_frame", lambda *_: Frame(T_scene_scan=T))
+    made = add_scan(tiny_prior, first, scan("b", THEN), CONFIG)
+    np.testing.assert_array_equal(made.scans[1].frame.T_scene_scan, T)
+    assert [name for name, _ in searched] == ["matching"]
+    assert refined == [(3, CONFIG.matching.search.keep)] * 2
+
+
+def test_another_frame_changes_what_staying_means_and_nothing_else(tiny_prior, first):
+    second = scan("b", THEN)
+    codes = embed(tiny_prior, [i.points for i in second.instances])
+    old, new = compared_objects(first, second.instances, codes, second, CONFIG)
+    known = [o for o, _ in old]
+    identified = identify(tiny_prior, known, new, CONFIG)
+    pairs = relocalize.pairs_found(identified, known, new)
+    T = np.eye(4)
+    T[:3, 3] = [0.1, -0.2, 0.3]
+    moved = relocalize.with_frame(pairs, T)
+    np.testing.assert_allclose(moved.to_world(moved.stayed), np.tile(T, (len(pairs), 1, 1)), atol=1e-6)
+    np.testing.assert_array_equal(moved.candidates.wxyz_xyz, pairs.candidates.wxyz_xyz)
+
+
+def test_where_matching_found_no_poses_registration_searches_once(tiny_prior, first, searched, refined):
+    config = dataclasses.replace(CONFIG, matching=preset("paper").matching)
+    add_scan(tiny_prior, first, scan("b", THEN), config)
+    assert searched == [("registration", 4)]  # three pairs, and one that fills up
+    assert len(refined) == 1
+
+
+def test_an_object_is_prepared_once_whatever_number_of_pairs_it_is_part_of(tiny_prior, first, monkeypatch):
+    prepared = []
+    original = search._alignable
+
+    def watched(batch, **settings):
+        prepared.append(len(batch.cloud.points))
+        return original(batch, **settings)
+
+    monkeypatch.setattr(search, "_alignable", watched)
+    add_scan(tiny_prior, first, scan("b", THEN), CONFIG)
+    assert prepared == [search.OBJECTS_A_CALL] * 2  # the scene's objects, the scan's instances
