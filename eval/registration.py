@@ -169,7 +169,7 @@ def own_records(
         seconds = encoding_s + (time.perf_counter() - began) / len(pairs)
         seconds += looking_s if config.free_weight else 0.0
         found += [scored(p, T, name, seconds) for p, T in zip(pairs, poses, strict=True)]
-        if closed_by and closed_by.closing.steps and name == next(iter(settings)):
+        if closed_by and closed_by.pose_graph.steps and name == next(iter(settings)):
             found += closed_records(
                 prior, pairs, [p.target_code for p in ready], poses, closed_by, f"{name}, {CLOSED}", seconds
             )

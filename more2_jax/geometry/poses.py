@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import jax.numpy as jnp
 import jaxlie
 import numpy as np
 from jaxtyping import Float
@@ -56,6 +55,6 @@ def in_frames(
 
 def local_pose(T_ref_scan: Pose, ref_origin: np.ndarray, scan_origin: np.ndarray) -> np.ndarray:
     """The pose between local frames, as jaxlie's (qw, qx, qy, qz, x, y, z)."""
-    T = T_ref_scan.copy()
-    T[:3, 3] = apply_pose(T_ref_scan, scan_origin[None])[0] - ref_origin
-    return np.asarray(jaxlie.SE3.from_matrix(jnp.asarray(T, jnp.float32)).wxyz_xyz)
+    shift = apply_pose(T_ref_scan, scan_origin[None])[0] - ref_origin
+    quaternion = Rotation.from_matrix(T_ref_scan[:3, :3]).as_quat(canonical=True, scalar_first=True)
+    return np.concatenate([quaternion, shift])
