@@ -29,7 +29,7 @@ from eval.scores.mesh_scores import RECONSTRUCTED, mesh_scores
 from eval.scores.pose_scores import pose_scores
 from more2_jax.config import CodeMatcher, JointConfig, SceneConfig
 from more2_jax.network.prior import Prior
-from more2_jax.refinement.joint_of_objects import repose
+from more2_jax.refinement.joint_of_objects import with_poses
 from more2_jax.types import ObservedObject, SceneObject
 from train.run.program import run
 
@@ -171,7 +171,7 @@ def registered(
         used += len(clouds)
     poses = iter(register_all(prior, pairs, config.registration, config.motion, batch))
     posed = [
-        repose(x, [np.eye(4), *(next(poses) for _ in clouds[1:])])
+        with_poses(x, [np.eye(4), *(next(poses) for _ in clouds[1:])])
         for x, clouds in zip(objects, raw, strict=True)
     ]
     again = embed_all(prior, [x.points for x in posed], batch)

@@ -29,7 +29,7 @@ from eval.scores.figures import Column, Figure, Record
 from eval.scores.mesh_scores import RECONSTRUCTED, mesh_scores
 from more2_jax.config import SceneConfig, preset
 from more2_jax.geometry.poses import apply_pose
-from more2_jax.meshing.object_mesh import mesh_of
+from more2_jax.meshing.object_mesh import object_mesh
 from more2_jax.network.prior import Prior
 from more2_jax.refinement.joint_of_objects import fit_objects
 from more2_jax.scene import record
@@ -188,7 +188,7 @@ def embedded(prior: Prior, seen: Sequence[Seen], batch: int) -> list[SceneObject
 def mesh_seen(prior: Prior, s: Seen, o: SceneObject, config: SceneConfig) -> Mesh | None:
     """The mesh of an object in the room that its scans show."""
     scans = [record(k, scan, list(scan.instances), ()) for k, scan in enumerate(s.scene.scans)]
-    return mesh_of(prior, o, scans, config)
+    return object_mesh(prior, o, scans, config)
 
 
 def fitted_in_batches(

@@ -183,7 +183,7 @@ def own_records(
         told = isinstance(method, SurfaceRegistration) and upright and method.search.free_weight > 0
         seconds += looking_s if told else 0.0
         found += [scored(p, T, name, seconds) for p, T in zip(pairs, poses, strict=True)]
-        if closed_by and closed_by.closing.steps and name == next(iter(settings)):
+        if closed_by and closed_by.pose_graph.steps and name == next(iter(settings)):
             found += closed_records(
                 prior,
                 pairs,

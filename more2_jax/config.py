@@ -154,13 +154,13 @@ MotionModel = Literal["free", "upright"]
 
 @dataclass(frozen=True)
 class JointConfig:
-    """Joint optimization (paper §3.5); the defaults are the paper's."""
+    """Joint optimization of code and poses (paper §3.5); the defaults are the paper's."""
 
-    points: int = 1024
+    steps: int = 200  # of Adam. 0: codes and poses stay
+    points: int = 1024  # farthest points of every observation
     start: Literal["best", "accumulated"] = (
-        "best"  # F_0: code of the observation with the lowest L_sdf, or of all
+        "best"  # F_0: the code of the observation with the lowest loss, or that of all together
     )
-    steps: int = 200
     eqv_learning_rate: float = 1e-4
     pose_learning_rate: float = 5e-5
     inv_learning_rate: float = 1e-5
@@ -169,39 +169,35 @@ class JointConfig:
 
 @dataclass(frozen=True)
 class MeshingConfig:
-    """Mesh extraction (paper §3.4): multi-resolution iso-surface extraction, then marching cubes."""
+    """Mesh extraction: multi-resolution iso-surface extraction (paper §3.4), drawn to observed points (not in it).
 
-    coarse: int = 32  # cells a side of the first grid
-    resolution: int = 64  # of the last: `coarse`, doubled once or more
-    field_resolution: int = 0  # grids of up to so many ask the field, finer ones interpolate. 0: all ask
+    Lengths are in canonical units. The values of `robust` and what they were chosen by: docs/design_notes.md.
+    """
+
+    coarse_resolution: int = 32  # cells a side of the first grid
+    resolution: int = 64  # of the last: `coarse_resolution`, doubled some times
+    field_resolution: int = (
+        0  # the finest grid that the network is asked on; finer ones interpolate. 0: all ask
+    )
     level: Literal["zero", "observed"] = (
-        "zero"  # which level is the surface: 0, or the field's median at the points
+        "zero"  # the surface's level: 0, or the field's median at the observed points
     )
-    seen_reach: float = (
-        0.0  # canonical units: nearer to a seen point the surface runs through such points. 0: never
-    )
-    # On grids finer than `field_resolution`, so near (canonical units) to seen points their sides count, not its.
-    screening: float = 0.0
-    # … where several scans saw the object and points lie in their planes without noise to speak of; 0: as near.
-    screening_of_many: float = 0.0
-    # A seen point whose local outlier factor is larger is no surface: where one scan saw the object, and where several
-    # did, which confirm one another. 0: all points count.
+    mls_bandwidth: float = 0.0  # of implicit moving least squares at observed points. 0: the field alone
+    # ℓ of the screened Poisson equation, on grids finer than `field_resolution`: so near to observed points their
+    # normals say what is inside, farther off the field does. 0: no such equation.
+    screening_length: float = 0.0
+    screening_length_multi_scan: float = 0.0  # of points without noise that several scans saw. 0: the same
+    # Points with a larger local outlier factor are left out. 0: all points stay.
     outlier_factor: float = 0.0
-    outlier_factor_of_many: float = 0.0
-    floor: bool = False  # of upright scans: nothing reaches below the floor, where the room is seen
-    half_width: float = 0.65  # of the query box, canonical units; objects are turned in it, so more than 0.55
+    outlier_factor_multi_scan: float = 0.0  # where several scans saw the object, and confirm one another
+    clip_to_floor: bool = False  # of upright scans with a visible floor: nothing reaches below it
 
 
 @dataclass(frozen=True)
-class ClosingConfig:
-    """All observations of an object laid onto one another at once, before its mesh is made; canonical units."""
+class PoseGraphConfig:
+    """Pose-graph optimization of all observations of an object, before its mesh is made; not in the paper."""
 
-    steps: int = 0  # of all poses together; 0: they stay as registered
-    points: int = 1024  # of every observation
-    first_reach: float = 0.05  # off the surface; farther apart counts less than a quarter
-    last_reach: float = 0.001
-    # Among noise an observation that would turn farther has slipped, and stays as registered.
-    most_turn_deg: float = 3.0
+    steps: int = 0  # of Gauss-Newton. 0: poses stay as registered
 
 
 @dataclass(frozen=True)
@@ -218,7 +214,7 @@ class SceneConfig:
     accumulate_misfit: float = 1.0  # an observation whose registration fits worse is left out of the shape
     matching: Matcher = field(default_factory=CodeMatcher)
     registration: RegistrationMethod = field(default_factory=DescentRegistration)
-    closing: ClosingConfig = field(default_factory=ClosingConfig)
+    pose_graph: PoseGraphConfig = field(default_factory=PoseGraphConfig)
     joint: JointConfig = field(default_factory=JointConfig)
     meshing: MeshingConfig = field(default_factory=MeshingConfig)
 
@@ -229,16 +225,16 @@ class SceneConfig:
 
 
 ROBUST_MESHING = MeshingConfig(
-    coarse=16,
+    coarse_resolution=16,
     resolution=128,
     field_resolution=32,
     level="observed",
-    seen_reach=0.02,
-    screening=0.12,
-    screening_of_many=0.3,
+    mls_bandwidth=0.02,
+    screening_length=0.12,
+    screening_length_multi_scan=0.3,
     outlier_factor=1.5,
-    outlier_factor_of_many=1.25,
-    floor=True,
+    outlier_factor_multi_scan=1.25,
+    clip_to_floor=True,
 )
 
 
@@ -255,7 +251,7 @@ def preset(name: str, *, upright: bool = False) -> SceneConfig:
             matching=EvidenceMatcher(),
             registration=SurfaceRegistration(),
             meshing=ROBUST_MESHING,
-            closing=ClosingConfig(steps=16),
+            pose_graph=PoseGraphConfig(steps=16),
             # No step: after alignment by surfaces it buys neither poses nor meshes (docs/design_notes.md).
             joint=JointConfig(points=128, start="accumulated", steps=0, eqv_learning_rate=1e-3),
         )
@@ -267,6 +263,19 @@ RENAMED = {
     "neighbours": "neighbors",
     "normal_neighbours": "normal_neighbors",
     "core_neighbours": "core_neighbors",
+    "closing": "pose_graph",
+    "coarse": "coarse_resolution",
+    "seen_reach": "mls_bandwidth",
+    "screening": "screening_length",
+    "screening_of_many": "screening_length_multi_scan",
+    "outlier_factor_of_many": "outlier_factor_multi_scan",
+    "floor": "clip_to_floor",
+}
+
+# Settings of older files that are constants now, by class, with the only value they may have.
+NOW_CONSTANT: dict[str, dict[str, Any]] = {
+    "MeshingConfig": {"half_width": 0.65},
+    "PoseGraphConfig": {"points": 1024, "first_reach": 0.05, "last_reach": 0.001, "most_turn_deg": 3.0},
 }
 
 
@@ -275,6 +284,9 @@ def from_dict(cls: type[C], values: dict[str, Any], where: str = "") -> C:
     if not isinstance(values, dict):
         raise ValueError(f"{where or 'settings'}: got {values!r}, needed a mapping")
     values = {RENAMED.get(key, key): value for key, value in values.items()}
+    for key, only in NOW_CONSTANT.get(cls.__name__, {}).items():
+        if values.pop(key, only) != only:
+            raise ValueError(f"{where or 'settings'}: {key} is no setting any more; needed {only}, or none")
     hints = typing.get_type_hints(cls)
     names = {f.name for f in dataclasses.fields(cls)}  # type: ignore[arg-type]
     if unknown := sorted(set(values) - names):

@@ -12,12 +12,12 @@ from jaxtyping import Float
 from more2_jax.config import EvidenceMatcher, SceneConfig
 from more2_jax.geometry.poses import Pose, apply_pose
 from more2_jax.matching.color import color_of
-from more2_jax.meshing.object_mesh import floor_of, meshes_of, seen_often
+from more2_jax.meshing.object_mesh import in_several_scans, object_floor, object_meshes
 from more2_jax.network.embedding_batch import embed
 from more2_jax.network.prior import Prior
 from more2_jax.progress import Watcher, staged
 from more2_jax.refinement.joint_of_objects import embed_accumulated, fit_objects
-from more2_jax.refinement.pose_graph_of_objects import close_objects
+from more2_jax.refinement.pose_graph_of_objects import refine_object_poses
 from more2_jax.tracking.identify import identify
 from more2_jax.tracking.object_views import few_sensors, instance_sights, object_sights
 from more2_jax.tracking.objects import (
@@ -102,22 +102,22 @@ def reconstruct(
 ) -> LivingScene:
     """Poses of objects seen more than once are made to agree, or optimized with the code; then meshes are extracted.
 
-    `closing.steps` (`robust`): all observations of an object are laid onto one another at once. `joint.steps`
+    `pose_graph.steps` (`robust`): all observations of an object are aligned with one another at once. `joint.steps`
     (`paper`): code and poses of all objects are optimized in one call. Observations in doubt
     (`Observation.accumulated` False) have no part in it. Objects that have a mesh have not changed since and are left
     alone.
     """
     timing, objects = dict(scene.timing_s), list(scene.objects)
     todo = [k for k, o in enumerate(objects) if o.mesh is None]
-    again = [k for k in todo if seen_often(objects[k])]
-    close, fit = again if config.closing.steps else [], again if config.joint.steps else []
+    again = [k for k in todo if in_several_scans(objects[k])]
+    close, fit = again if config.pose_graph.steps else [], again if config.joint.steps else []
     with staged(timing, progress, "close", len(close)):
-        floors = {k: floor_of(objects[k], scene.scans, config) for k in close}
-        objects = close_objects(prior, objects, close, scene.scans, floors, config)
+        floors = {k: object_floor(objects[k], scene.scans, config) for k in close}
+        objects = refine_object_poses(prior, objects, close, scene.scans, floors, config)
     with staged(timing, progress, "joint", len(fit)):
         objects = fit_objects(prior, objects, fit, config)
     with staged(timing, progress, "mesh", len(todo)) as advance:
-        meshes = meshes_of(prior, [objects[k] for k in todo], scene.scans, config)
+        meshes = object_meshes(prior, [objects[k] for k in todo], scene.scans, config)
         for done, (k, mesh) in enumerate(zip(todo, meshes, strict=True), start=1):
             objects[k] = dataclasses.replace(objects[k], mesh=mesh)
             advance(done)

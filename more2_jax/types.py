@@ -16,6 +16,11 @@ from jaxtyping import Bool, Float, Int
 
 T = TypeVar("T")
 
+if TYPE_CHECKING:
+    AnyArray = Array  # to a checker of types; records between compiled calls hold NumPy arrays as well
+else:
+    AnyArray = Array | np.ndarray
+
 # How a quantity of a record changes when the record is moved by T = (R, t) or rescaled by s (`geometry.transform`):
 # "position" s·x, R x + t · "offset" (between positions) s·x, R x · "direction" x, R x · "columns" (directions in
 # columns) x, R x · "length" s·x, x · "pose" (between the record's frames) rescaled only · "covariance" (of shift and

@@ -12,7 +12,7 @@ from small_scenes import CONFIG, MARK, ROBUST, piece, scan
 
 from more2_jax.config import JointConfig, MeshingConfig, preset
 from more2_jax.meshing import object_mesh
-from more2_jax.meshing.object_mesh import floor_under
+from more2_jax.meshing.object_mesh import object_floor
 from more2_jax.registration import search, surface
 from more2_jax.scene import add_scan, reconstruct, start_scene
 from more2_jax.tracking.objects import moved_probability, points_of
@@ -141,12 +141,12 @@ def test_meshes_come_in_order_whichever_is_ready_first_and_errors_come_through(
         time.sleep(waits[o.id])
         return Mesh(vertices=np.full((1, 3), waits[o.id]), faces=np.zeros((0, 3), int))
 
-    monkeypatch.setattr(object_mesh, "mesh_of", slow)
+    monkeypatch.setattr(object_mesh, "object_mesh", slow)
     config = dataclasses.replace(CONFIG, joint=JointConfig(steps=0))
     bare = dataclasses.replace(scene, objects=tuple(dataclasses.replace(o, mesh=None) for o in scene.objects))
     done = reconstruct(tiny_prior, bare, config)
     assert [o.mesh.vertices[0, 0] for o in done.objects] == [waits[o.id] for o in scene.objects]
-    monkeypatch.setattr(object_mesh, "mesh_of", lambda prior, o, scans, config: 1 / 0)
+    monkeypatch.setattr(object_mesh, "object_mesh", lambda prior, o, scans, config: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         reconstruct(tiny_prior, bare, config)
 
@@ -158,26 +158,26 @@ def test_several_scans_confirm_one_another_one_does_not(monkeypatch, tiny_prior,
     monkeypatch.setattr(
         object_mesh,
         "extract_mesh",
-        lambda prior, code, meshing, *_: asked.append(meshing.screening_of_many),
+        lambda prior, code, meshing, *_: asked.append(meshing.screening_length_multi_scan),
     )
     often = scene.objects[0]
     doubted = tuple(
         dataclasses.replace(s, accumulated=s.scan == often.reference_scan) for s in often.observations
     )
     for o in (often, dataclasses.replace(often, observations=doubted)):
-        object_mesh.mesh_of(tiny_prior, o, scene.scans, ROBUST)
+        object_mesh.object_mesh(tiny_prior, o, scene.scans, ROBUST)
     assert len(often.observations) == 3
-    assert asked == [ROBUST.meshing.outlier_factor_of_many, 0.3, ROBUST.meshing.outlier_factor, 0.0]
+    assert asked == [ROBUST.meshing.outlier_factor_multi_scan, 0.3, ROBUST.meshing.outlier_factor, 0.0]
 
 
-@pytest.mark.parametrize("steps", ["joint", "closing"])
+@pytest.mark.parametrize("steps", ["joint", "pose_graph"])
 def test_without_steps_codes_and_poses_stay_and_with_them_they_do_not(tiny_prior, scene, steps):
-    """The preset `robust` has none of `joint`, `paper` none of `closing`."""
-    none = {"joint": ROBUST.joint, "closing": preset("paper").closing}
+    """The preset `robust` has none of `joint`, `paper` none of `pose_graph`."""
+    none = {"joint": ROBUST.joint, "pose_graph": preset("paper").pose_graph}
     without = dataclasses.replace(CONFIG, **none)
     some = dataclasses.replace(without, **{steps: getattr(CONFIG, steps)})
     stayed, moved = (reconstruct(tiny_prior, scene, c) for c in (without, some))
-    assert ROBUST.joint.steps == preset("paper").closing.steps == 0
+    assert ROBUST.joint.steps == preset("paper").pose_graph.steps == 0
     for before, after, other in zip(scene.objects, stayed.objects, moved.objects, strict=True):
         assert after.embedding is before.embedding and after.observations is before.observations
         assert (other.embedding is not before.embedding) == (len(before.observations) > 1)
@@ -225,6 +225,7 @@ def test_the_floor_under_an_object_is_that_of_its_room(scene, lowest, settings, 
     points = rng.uniform([-0.2, -0.2, lowest], [0.2, 0.2, lowest + 0.5], (500, 3))
     o = dataclasses.replace(scene.objects[0], points=points, point_scan=np.zeros(500, int))
     config = dataclasses.replace(preset("robust", upright=True), **settings)
-    found = floor_under(o, room, config)
+    scans = [dataclasses.replace(scene.scans[0], background=b) for b in (room, np.zeros((0, 3)))]
+    found = object_floor(o, scans[:1], config)
     assert found == (None if floor is None else pytest.approx(floor, abs=2e-3))
-    assert floor_under(o, np.zeros((0, 3)), config) is None
+    assert object_floor(o, scans[1:], config) is None

@@ -1,4 +1,4 @@
-"""Registered pairs as a living scene has them in the end: both observations laid onto one another (`closing`)."""
+"""Registered pairs as a living scene has them in the end: both observations aligned with one another (`pose_graph`)."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ import numpy as np
 
 from eval.scores.pose_scores import Pose
 from more2_jax.config import SceneConfig
-from more2_jax.meshing.object_mesh import floor_of
+from more2_jax.meshing.object_mesh import object_floor
 from more2_jax.network.prior import Prior
-from more2_jax.refinement.pose_graph_of_objects import close_objects
+from more2_jax.refinement.pose_graph_of_objects import refine_object_poses
 from more2_jax.scene import record
 from more2_jax.tracking.objects import new_object, seen_again
 from more2_jax.types import Embedding, Instance, Observation, Scan, ScanRecord, SceneObject
@@ -36,6 +36,6 @@ def closed_poses(
         )
         o = new_object(k, 2 * k, Instance(id=0, points=target), codes[k])
         objects.append(seen_again(o, Instance(id=0, points=source), seen))
-    floors = {k: floor_of(o, records, config) for k, o in enumerate(objects)}
-    closed = close_objects(prior, objects, range(len(objects)), records, floors, config)
+    floors = {k: object_floor(o, records, config) for k, o in enumerate(objects)}
+    closed = refine_object_poses(prior, objects, range(len(objects)), records, floors, config)
     return [o.observations[1].T_ref_scan for o in closed]

@@ -1,10 +1,10 @@
-"""Free space: what sensors at known places looked through holds nothing of an object.
+"""Free space: the volume along the view rays of sensors at known positions holds nothing of an object.
 
-Beyond the paper. A view is a coarse depth image about one object, made of all points of its scan (the object's, its
+Not in the paper. A view is a coarse depth image about one object, made of all points of its scan (the object's, its
 neighbors', the room's): along a ray the space is free up to the nearest point in that pixel or beside it, less a
 margin that grows as a depth camera's noise does. A pixel without points says nothing. No image of the sensor is
 needed, only where it stood; so a surface that no sensor caught, as it was seen too steeply or not sampled, may be
-looked through by mistake, and free space has a say, not the last word.
+taken for free by mistake: free space is evidence, not a constraint.
 """
 
 from __future__ import annotations
@@ -23,13 +23,18 @@ from scipy.spatial import KDTree
 from more2_jax.geometry.poses import Points
 from more2_jax.types import Sight
 
-VIEWS = 8  # of an object: places that lie farthest apart, as it sees them
-PIXELS = 96  # at most, a side of a view
-FEWEST_PIXELS = 16
-WIDE = 1.2  # half the width of a view, in that of the object as seen
-COARSE = 2.5  # pixels are so many times the median angle between neighboring points of the object
-NEAREST_M = 0.05  # of what lies nearer to a sensor, it sees nothing
-MARGIN_M, MARGIN_PER_M2 = 0.02, 0.005  # kept from a seen point, and more with the square of its distance
+VIEWS = 8  # of an object: the sensors whose directions lie farthest apart
+PIXELS = 96  # at most, a side of a view: that bounds its memory
+MIN_PIXELS = 16
+IMAGE_MARGIN = 1.2  # half the width of a view, in that of the object's image
+PIXEL_SPACINGS = (
+    2.5  # a pixel is so many times the median angle between neighboring points, so that few are empty
+)
+MIN_DEPTH_M = 0.05  # sensors see nothing nearer
+MARGIN_M, MARGIN_PER_M2 = (
+    0.02,
+    0.005,
+)  # noise of a depth camera: constant, and with the square of the distance
 
 
 def sight_of(cloud: Points, room: Points, sensors: Points) -> Sight | None:
@@ -59,14 +64,14 @@ def view_of(cloud: Points, room: Points, eye: Float[np.ndarray, "3"]) -> Sight |
     """The view of one sensor, unbatched. None where the cloud comes too near it or nearly around it."""
     turn = axes_toward(cloud.mean(axis=0) - eye)
     own = (cloud - eye) @ turn.T
-    if (own[:, 2] < NEAREST_M).any():
+    if (own[:, 2] < MIN_DEPTH_M).any():
         return None
     image = own[:, :2] / own[:, 2:]
-    half = WIDE * float(np.abs(image).max()) + 1e-6
+    half = IMAGE_MARGIN * float(np.abs(image).max()) + 1e-6
     spacing = float(np.median(KDTree(image).query(image, k=2)[0][:, 1])) if len(image) > 1 else half
-    side = int(np.clip(2 * half / (COARSE * spacing + 1e-9), FEWEST_PIXELS, PIXELS))
+    side = int(np.clip(2 * half / (PIXEL_SPACINGS * spacing + 1e-9), MIN_PIXELS, PIXELS))
     seen = (room - eye) @ turn.T
-    seen = seen[seen[:, 2] > NEAREST_M]
+    seen = seen[seen[:, 2] > MIN_DEPTH_M]
     pixel = np.floor((seen[:, :2] / seen[:, 2:] / half + 1) / 2 * side).astype(int)
     within = ((pixel >= 0) & (pixel < side)).all(axis=1)
     depth = np.full((side, side), np.inf)
@@ -85,14 +90,14 @@ def margin(depth: Float[np.ndarray, "*_"]) -> Float[np.ndarray, "*_"]:
 
 
 def axes_toward(way: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
-    """Right-handed rows: two across, and the unit direction of `way`."""
+    """Rotation into a camera's axes: two rows of the image plane, and the unit direction of `way`, right-handed."""
     forward = way / np.linalg.norm(way)
-    across = np.cross(forward, np.eye(3)[np.abs(forward).argmin()])
-    across /= np.linalg.norm(across)
-    return np.stack([across, np.cross(forward, across), forward])
+    sideways = np.cross(forward, np.eye(3)[np.abs(forward).argmin()])
+    sideways /= np.linalg.norm(sideways)
+    return np.stack([sideways, np.cross(forward, sideways), forward])
 
 
-# --- views that are put together, moved, padded -------------------------------------------------------------
+# --- views stacked and padded -------------------------------------------------------------------------------
 
 
 def stacked(views: Sequence[Sight]) -> Sight | None:
@@ -103,7 +108,7 @@ def stacked(views: Sequence[Sight]) -> Sight | None:
 
 
 def padded_sights(sights: Sequence[Sight | None], origins: Float[np.ndarray, "b 3"]) -> Sight | None:
-    """One of `VIEWS` views for every row of a batch, about its origin, float32; views that say nothing fill up.
+    """One of `VIEWS` views for every row of a batch, about its origin, float32; views without free space fill up.
 
     None where no row has any.
     """
@@ -113,7 +118,7 @@ def padded_sights(sights: Sequence[Sight | None], origins: Float[np.ndarray, "b 
         eye=np.zeros((VIEWS, 3)),
         turn=np.tile(np.eye(3), (VIEWS, 1, 1)),
         half=np.ones(VIEWS),
-        side=np.full(VIEWS, FEWEST_PIXELS),
+        side=np.full(VIEWS, MIN_PIXELS),
         clear=np.zeros((VIEWS, PIXELS, PIXELS)),
     )
     rows = []

@@ -1,7 +1,7 @@
-"""Points that lie apart from their neighborhood: flying pixels and depth noise, not a piece's surface.
+"""Local outlier factors: points apart from their neighborhood are flying pixels and depth noise, not a surface.
 
-Local outlier factor (Breunig et al., 2000) in its simplest form: how far a point's neighbors are, against how far
-those of its neighbors are. Sparse sampling alone makes no outlier, since it is sparse around it as well.
+After Breunig et al. (2000), in the simplest form: how far a point's neighbors are, against how far those of its
+neighbors are. Sparse sampling alone makes no outlier, since it is sparse around it as well.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.spatial import KDTree
 
-NEIGHBORS = 12
+NEIGHBORS = 12  # those of the planes of a mesh: what is no surface there is left out here
 
 Points = Float[np.ndarray, "n 3"]
 
@@ -28,6 +28,6 @@ def outlier_factors(points: Points) -> Float[np.ndarray, " n"]:
     return np.divide(own, around, out=np.ones(len(points)), where=around > 0)
 
 
-def inliers(points: Points, most: float) -> Bool[np.ndarray, " n"]:
-    """True for points whose factor is `most` or less; for all where `most` is 0."""
-    return outlier_factors(points) <= most if most else np.ones(len(points), bool)
+def inliers(points: Points, max_factor: float) -> Bool[np.ndarray, " n"]:
+    """True for points whose factor is `max_factor` or less; for all where that is 0."""
+    return outlier_factors(points) <= max_factor if max_factor else np.ones(len(points), bool)

@@ -1,4 +1,4 @@
-"""Values on a regular grid of points: where the points lie, finer grids, and the part that matters."""
+"""Fields sampled on a regular lattice: where its corners lie, finer lattices, cells near the surface."""
 
 from __future__ import annotations
 
@@ -34,8 +34,8 @@ class Lattice:
         """The lattice with half the step, over the same box."""
         return Lattice(self.low, self.step / 2, tuple(2 * n - 1 for n in self.shape))
 
-    def near(self, points: Points, distance: float) -> Mask:
-        """Corners that may be so near to a point; some that are a little farther too."""
+    def corners_near(self, points: Points, distance: float) -> Mask:
+        """Corners within `distance` of a point, and some a little farther off."""
         corner = np.rint((points - self.low) / self.step).astype(int)
         held = corner[((corner >= 0) & (corner < self.shape)).all(axis=1)]
         holds = np.zeros(self.shape, bool)
@@ -44,18 +44,18 @@ class Lattice:
 
 
 @dataclass(frozen=True)
-class Level:
-    """A field on a lattice, and the values whose zero is the surface."""
+class GridField:
+    """A field on a lattice, and the values whose zero level is the surface."""
 
     lattice: Lattice
-    field: Grid
-    values: Grid
+    field: Grid  # the network's, or interpolated
+    values: Grid  # corrected by what was observed
 
-    def finer(self) -> Level:
+    def finer(self) -> GridField:
         """Both interpolated to half the step."""
-        return Level(self.lattice.finer(), doubled(self.field), doubled(self.values))
+        return GridField(self.lattice.finer(), upsampled(self.field), upsampled(self.values))
 
-    def around(self, kept: Mask, margin: float) -> Level:
+    def around(self, kept: Mask, margin: float) -> GridField:
         """The box that holds all corners of `kept`, and `margin` (canonical units) around it; all, if it is empty."""
         held = np.argwhere(kept)
         if not len(held):
@@ -65,7 +65,7 @@ class Level:
         last = np.minimum(held.max(axis=0) + cells + 1, self.field.shape)
         box = tuple(slice(a, b) for a, b in zip(first, last, strict=True))
         field, values = self.field[box], self.values[box]
-        return Level(replace(self.lattice, low=self.lattice.at(first), shape=field.shape), field, values)
+        return GridField(replace(self.lattice, low=self.lattice.at(first), shape=field.shape), field, values)
 
 
 def cube(cells: int, half: float) -> Lattice:
@@ -73,7 +73,7 @@ def cube(cells: int, half: float) -> Lattice:
     return Lattice(np.full(3, -half), 2 * half / cells, (cells + 1,) * 3)
 
 
-def doubled(x: Grid) -> Grid:
+def upsampled(x: Grid) -> Grid:
     """Linear interpolation to half the step: `scipy.ndimage.zoom`, which takes eight times as long."""
     for axis in (2, 1, 0):
         shape = list(x.shape)
@@ -86,7 +86,7 @@ def doubled(x: Grid) -> Grid:
     return x
 
 
-def near_surface(values: Grid, step: float) -> Mask:
+def surface_cells(values: Grid, step: float) -> Mask:
     """Cells whose corners differ in sign, or are nearer to the surface than the cell's diagonal: a thin leg may
     pass between corners. One ring of cells more, since the field is only nearly a distance."""
     i, j, k = (n - 1 for n in values.shape)

@@ -1,4 +1,4 @@
-"""Meshes of a scene's objects (paper §3.4): what was seen of each, its floor and its box, handed to extraction."""
+"""Mesh of one object of a living scene: its inlier points, its floor, its query box, then extraction (paper §3.4)."""
 
 from __future__ import annotations
 
@@ -13,80 +13,85 @@ from jaxtyping import Float
 from more2_jax.config import SceneConfig
 from more2_jax.geometry.floor import floor_height
 from more2_jax.geometry.outliers import inliers
-from more2_jax.meshing.extract import extract_mesh, observed_level
-from more2_jax.meshing.observed_surface import some_of
+from more2_jax.meshing.extract import HALF_WIDTH, extract_mesh, observed_level
+from more2_jax.meshing.observed_surface import uniform_subsample
 from more2_jax.network.prior import Prior
 from more2_jax.tracking.object_views import seen_from
-from more2_jax.tracking.objects import (
-    accumulated,
-    accumulated_points,
-)
+from more2_jax.tracking.objects import accumulated, accumulated_points
 from more2_jax.types import Mesh, ScanRecord, SceneObject
 
-STRAYS = 0.02  # share of an object's points that may lie below the floor,
-BELOW_M = 0.05  # by more than this
+# An object stands on another floor than the visible one where more than so many of its points lie clearly below that.
+BELOW_FLOOR_SHARE = 0.02
+BELOW_FLOOR_M = 0.05
+# Half the query box: what was observed (but for a hundredth of stray points) and a little more, within limits.
+BOX_QUANTILE = 0.99
+BOX_MARGIN = 1.15
+MAX_BOX = 3.0  # times the usual half width
 # About 70 MB each: a scene of eight objects took 662 MB one at a time, 1,131 MB all at once.
 MESHES_AT_ONCE = 8
 
 
-def floor_under(o: SceneObject, background: Float[np.ndarray, "b 3"], config: SceneConfig) -> float | None:
-    """Height of the floor in an object's frame, meters; `background` is that of its reference scan.
-
-    None if it is not asked for, there is none to see, or the object was seen clearly below it: then it is another's.
-    """
-    if not (config.upright and config.meshing.floor):
-        return None
-    floor = floor_height(background)
-    if floor is None or float(np.quantile(accumulated_points(o)[:, 2], STRAYS)) < floor - BELOW_M:
-        return None
-    return floor
-
-
-def floor_of(o: SceneObject, scans: Sequence[ScanRecord], config: SceneConfig) -> float | None:
-    """`floor_under` an object in its reference scan."""
-    return floor_under(o, scans[o.reference_scan].background, config)
-
-
-def meshes_of(
+def object_meshes(
     prior: Prior, objects: Sequence[SceneObject], scans: Sequence[ScanRecord], config: SceneConfig
 ) -> Iterator[Mesh | None]:
     """The objects' meshes in their order, `MESHES_AT_ONCE` worked on side by side: most steps keep one core busy."""
     with ThreadPoolExecutor(min(MESHES_AT_ONCE, os.cpu_count() or 1)) as pool:
-        yield from pool.map(lambda o: mesh_of(prior, o, scans, config), objects)
+        yield from pool.map(lambda o: object_mesh(prior, o, scans, config), objects)
 
 
-def mesh_of(prior: Prior, o: SceneObject, scans: Sequence[ScanRecord], config: SceneConfig) -> Mesh | None:
-    """The object's mesh, in a box that holds all that was seen of it, and above the floor of its reference scan.
+def object_mesh(
+    prior: Prior, o: SceneObject, scans: Sequence[ScanRecord], config: SceneConfig
+) -> Mesh | None:
+    """The object's mesh in its reference frame, meters; None where its field has no surface.
 
-    `level` "observed": seen points lie on the surface, so the field's median there is its bias, and is taken off.
+    The query box holds all that was seen of the object; nothing lies below the floor of its reference scan. `level`
+    "observed": seen points lie on the surface, so the field's median there is its bias, and is taken off.
     """
-    points, eyes = trusted(o, scans, config)
-    level = observed_level(prior, o.embedding, points) if config.meshing.level == "observed" else 0.0
-    floor = floor_of(o, scans, config)
-    half, meshing = box_half_width(o, config), config.meshing
-    if not seen_often(o):
-        meshing = dataclasses.replace(meshing, screening_of_many=0.0)
-    return extract_mesh(prior, o.embedding, meshing, half, level, points, floor, eyes)
+    meshing = config.meshing
+    points, sensors = inlier_points(o, scans, config)
+    level = observed_level(prior, o.embedding, points) if meshing.level == "observed" else 0.0
+    if not in_several_scans(o):
+        meshing = dataclasses.replace(meshing, screening_length_multi_scan=0.0)
+    half_width, floor = box_half_width(o), object_floor(o, scans, config)
+    return extract_mesh(prior, o.embedding, meshing, half_width, level, points, floor, sensors)
 
 
-def seen_often(o: SceneObject) -> bool:
+def object_floor(o: SceneObject, scans: Sequence[ScanRecord], config: SceneConfig) -> float | None:
+    """Height of the floor in an object's frame, meters, by the background of its reference scan.
+
+    None if it is not asked for, there is none to see, or the object was seen clearly below it: then it is another's.
+    """
+    if not (config.upright and config.meshing.clip_to_floor):
+        return None
+    floor = floor_height(scans[o.reference_scan].background)
+    if floor is None:
+        return None
+    lowest = float(np.quantile(accumulated_points(o)[:, 2], BELOW_FLOOR_SHARE))
+    return None if lowest < floor - BELOW_FLOOR_M else floor
+
+
+def in_several_scans(o: SceneObject) -> bool:
     """Whether several scans make up its shape."""
     return len(accumulated(o)) > 1
 
 
-def trusted(
+def inlier_points(
     o: SceneObject, scans: Sequence[ScanRecord], config: SceneConfig
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n s 3"] | None]:
-    """What was seen of an object without outliers, thinned, in its frame; and from where, if that is known and used."""
-    points = some_of(accumulated_points(o))
-    eyes = seen_from(o, scans) if config.meshing.seen_reach else None
-    most = config.meshing.outlier_factor_of_many if seen_often(o) else config.meshing.outlier_factor
-    kept = inliers(points, most)
-    return points[kept], None if eyes is None else some_of(eyes)[kept]
+    """A uniform subsample of an object's points without outliers, in its frame; and the sensors that may see them.
+
+    No sensors where they are not known, or not asked for.
+    """
+    meshing = config.meshing
+    points = uniform_subsample(accumulated_points(o))
+    sensors = seen_from(o, scans) if meshing.mls_bandwidth else None
+    factor = meshing.outlier_factor_multi_scan if in_several_scans(o) else meshing.outlier_factor
+    kept = inliers(points, factor)
+    return points[kept], None if sensors is None else uniform_subsample(sensors)[kept]
 
 
-def box_half_width(o: SceneObject, config: SceneConfig) -> float:
-    """Half the edge of the box to mesh, canonical units: at least the usual, and all of what was seen."""
+def box_half_width(o: SceneObject) -> float:
+    """Half the edge of the query box, canonical units: at least the usual, and all of what was seen."""
     center = o.embedding.scan_center()
-    seen = np.quantile(np.abs(accumulated_points(o) - center).max(axis=1), 0.99) / float(o.embedding.scale)
-    return float(np.clip(1.15 * seen, config.meshing.half_width, 3 * config.meshing.half_width))
+    reach = np.quantile(np.abs(accumulated_points(o) - center).max(axis=1), BOX_QUANTILE)
+    return float(np.clip(BOX_MARGIN * reach / float(o.embedding.scale), HALF_WIDTH, MAX_BOX * HALF_WIDTH))

@@ -1,93 +1,113 @@
-"""Planes through neighboring points of one cloud, their normals, and how rough the points are."""
+"""Least-squares planes through the nearest neighbors of every point of a cloud: normals, residuals, faces at edges.
+
+On the host, in float64: clouds differ in size, and every size would be one more compiled program.
+"""
 
 from __future__ import annotations
 
-import jax
-import jax.numpy as jnp
+from dataclasses import dataclass
+
 import numpy as np
-from jax import Array
 from jaxtyping import Float, Int
 
-from more2_jax.geometry.padding import MIN_POINTS, bucket
-from more2_jax.geometry.point_to_plane import least_axis
-from more2_jax.types import pytree
+FACE_NEIGHBORS = (
+    6  # of a plane that is to lie in one face beside an edge (docs/design_notes.md, "Exact points")
+)
+# Where the second variance is a smaller share of the first, points lie in a line, as along a scanner's, and in any
+# plane through it.
+LEAST_ASPECT = 0.05
+REPEATED = 1e-9  # of a matrix of trace 1: cross products shorter than this tell no axis
 
-OF_FACE = 6  # points of a plane, where they are exact,
-WIDE = 0.05  # unless their second variance is a smaller share of the first: points of a line lie in any plane
+Points = Float[np.ndarray, "n 3"]
+Neighbors = Int[np.ndarray, "n k"]
+Covariance = Float[np.ndarray, "n 3 3"]
 
 
-@pytree
+@dataclass(frozen=True, kw_only=True)
 class Planes:
-    """Of every point; normals have unit length and either sign."""
+    """Of every point the plane through its neighbors; normals have unit length and either sign."""
 
-    center: Float[Array | np.ndarray, "n 3"]  # the mean of its neighbors
-    normal: Float[Array | np.ndarray, "n 3"]  # of their plane of least squares
-    off: Float[Array | np.ndarray, " n"]  # their variance off that plane
-    spread: Float[Array | np.ndarray, " n"]  # and in all
-    face: Float[Array | np.ndarray, "n 3"]  # the normal of the face it lies on, if points are exact
-
-
-def planes_of(points: Float[np.ndarray, "n 3"], near: Int[np.ndarray, "n k"]) -> Planes:
-    """`planes` on the host, of a cloud of any size: padded by points that no neighbor of its own names."""
-    size = bucket(len(points), MIN_POINTS)
-    cloud, rows = np.zeros((size, 3), np.float32), np.zeros((size, near.shape[1]), np.int32)
-    cloud[: len(points)], rows[: len(points)] = points, near
-    found = jax.device_get(planes(cloud, rows))
-    return jax.tree.map(lambda x: np.asarray(x, np.float64)[: len(points)], found)
+    center: Points  # the neighbors' mean
+    normal: Points
+    residual_variance: Float[np.ndarray, " n"]  # of the neighbors, off the plane
+    total_variance: Float[np.ndarray, " n"]
 
 
-@jax.jit
-def planes(points: Float[Array, "n 3"], near: Int[Array, "n k"]) -> Planes:
-    """The plane through each point's neighbors; `near` names them, nearest first, the point itself among them."""
-    center, normal, second = fitted(points, near)
+def fit_planes(points: Points, neighbors: Neighbors) -> Planes:
+    """The plane of least squares through each point's neighbors; those name rows, the point's own among them."""
+    center, covariance = neighborhood_moments(points, neighbors)
+    normal = least_axes(covariance)
     return Planes(
         center=center,
         normal=normal,
-        off=variance(second, normal),
-        spread=jnp.trace(second, axis1=1, axis2=2),
-        face=facing(points, near, normal),
+        residual_variance=variance_along(covariance, normal),
+        total_variance=np.trace(covariance, axis1=1, axis2=2),
     )
 
 
-def fitted(
-    points: Float[Array, "n 3"], near: Int[Array, "n k"]
-) -> tuple[Float[Array, "n 3"], Float[Array, "n 3"], Float[Array, "n 3 3"]]:
-    """The neighbors' mean, the normal (of either sign) of their plane of least squares, and their covariance."""
-    around = points[near]
-    center = around.mean(axis=1)
-    x, y, z = jnp.moveaxis(around - center[:, None], 2, 0)
-    xx, xy, xz, yy, yz, zz = (
-        (a * b).mean(axis=1) for a, b in ((x, x), (x, y), (x, z), (y, y), (y, z), (z, z))
-    )
-    second = jnp.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], axis=1).reshape(-1, 3, 3)
-    return center, least_axis(second), second
+def face_normals(points: Points, neighbors: Neighbors, otherwise: Points) -> Points:
+    """Normals (of either sign) of points without noise: of the plane nearby that fits its own points and this one best.
 
-
-def facing(
-    points: Float[Array, "n 3"], near: Int[Array, "n k"], otherwise: Float[Array, "n 3"]
-) -> Float[Array, "n 3"]:
-    """Normals (of either sign) of exact points: of the plane around that its own points and this one lie best in.
-
-    So a point beside an edge has its face's normal, not the mean of two; of a thin leg's narrow sides likewise.
-    `otherwise` where all points around lie in lines, as along a scanner's.
+    Of the candidates, planes through six neighbors each, one lies within the point's own face, where the plane of
+    twelve neighbors beside an edge is the mean of two faces. `otherwise` where all points around lie in lines.
+    `neighbors`: nearest first, the point itself among them.
     """
-    center, normal, second = fitted(points, near[:, :OF_FACE])
-    least = variance(second, normal)
-    is_plane = breadth(second, least) > WIDE
-    off = jnp.sum((points[:, None] - center[near]) * normal[near], axis=2)
-    misfit = jnp.where(is_plane[near], least[near] + off**2, jnp.inf)
-    best = jnp.take_along_axis(near, jnp.argmin(misfit, axis=1)[:, None], axis=1)[:, 0]
-    return jnp.where(is_plane[near].any(axis=1)[:, None], normal[best], otherwise)
+    center, covariance = neighborhood_moments(points, neighbors[:, :FACE_NEIGHBORS])
+    normal = least_axes(covariance)
+    residual = variance_along(covariance, normal)
+    is_plane = np.asarray(aspect(covariance, residual) > LEAST_ASPECT)
+    # n · (p − c), with n · c made once for every plane and not for every pair
+    offset = np.einsum("ni,nki->nk", points, normal[neighbors])
+    offset -= np.einsum("ni,ni->n", normal, center)[neighbors]
+    misfit = np.where(is_plane[neighbors], residual[neighbors] + offset**2, np.inf)
+    best = np.take_along_axis(neighbors, misfit.argmin(axis=1)[:, None], axis=1)[:, 0]
+    return np.where(np.any(is_plane[neighbors], axis=1)[:, None], normal[best], otherwise)
 
 
-def variance(second: Float[Array, "n 3 3"], axis: Float[Array, "n 3"]) -> Float[Array, " n"]:
-    """Along unit axes."""
-    return jnp.sum(axis * jnp.sum(second * axis[:, None], axis=2), axis=1)
+def neighborhood_moments(points: Points, neighbors: Neighbors) -> tuple[Points, Covariance]:
+    """Mean and covariance of each point's neighbors."""
+    around = np.moveaxis(points[neighbors], 2, 0)
+    center = around.mean(axis=2)
+    around = around - center[:, :, None]
+    covariance = np.empty((len(points), 3, 3))
+    for i in range(3):
+        for j in range(i + 1):
+            covariance[:, i, j] = covariance[:, j, i] = np.einsum("nk,nk->n", around[i], around[j])
+    return center.T, covariance / neighbors.shape[1]
 
 
-def breadth(second: Float[Array, "n 3 3"], least: Float[Array, " n"]) -> Float[Array, " n"]:
-    """The middle variance as a share of the largest, given the least: 0 of points of a line."""
-    both = jnp.trace(second, axis1=1, axis2=2) - least
-    squares = jnp.sum(second**2, axis=(1, 2)) - least**2  # a² + b² of the other two; a + b is `both`
-    apart = jnp.sqrt(jnp.maximum(2 * squares - both**2, 0.0))
-    return (both - apart) / jnp.maximum(both + apart, 1e-30)
+def least_axes(covariance: Covariance) -> Points:
+    """Unit eigenvectors of the smallest eigenvalues of symmetric matrices.
+
+    In closed form, a third of the time of `numpy.linalg.eigh`: the rows of A − λ span the plane across the axis, so the
+    cross product of two is along it. Where the smallest eigenvalue is (nearly) repeated, `eigh` gives one of its axes.
+    """
+    size = np.trace(covariance, axis1=1, axis2=2)
+    a = covariance / np.maximum(size, np.finfo(float).tiny)[:, None, None]
+    b = a - np.eye(3) * (np.trace(a, axis1=1, axis2=2) / 3)[:, None, None]
+    p = np.sqrt(np.einsum("nij,nij->n", b, b) / 6)
+    det = np.einsum("ni,ni->n", b[:, 0], np.cross(b[:, 1], b[:, 2]))
+    angle = np.arccos(np.clip(det / np.maximum(2 * p**3, np.finfo(float).tiny), -1.0, 1.0)) / 3
+    m = b - np.eye(3) * (2 * p * np.cos(angle + 2 * np.pi / 3))[:, None, None]
+    crossed = np.stack([np.cross(m[:, i], m[:, (i + 1) % 3]) for i in range(3)], axis=1)
+    squared = np.einsum("nij,nij->ni", crossed, crossed)
+    row = np.arange(len(m)), squared.argmax(axis=1)
+    axis, length = crossed[row], np.sqrt(squared[row])
+    repeated = ~(length > REPEATED)
+    axis[repeated], length[repeated] = np.linalg.eigh(covariance[repeated])[1][:, :, 0], 1.0
+    return axis / length[:, None]
+
+
+def variance_along(covariance: Covariance, axis: Points) -> Float[np.ndarray, " n"]:
+    """Variance along unit axes."""
+    return np.einsum("ni,nij,nj->n", axis, covariance, axis)
+
+
+def aspect(covariance: Covariance, least: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+    """The middle eigenvalue as a share of the largest, given the least: 0 of points of a line."""
+    both = np.trace(covariance, axis1=1, axis2=2) - least
+    squares = (
+        np.einsum("nij,nij->n", covariance, covariance) - least**2
+    )  # a² + b² of the other two; a + b is `both`
+    apart = np.sqrt(np.maximum(2 * squares - both**2, 0.0))
+    return (both - apart) / np.maximum(both + apart, np.finfo(float).tiny)

@@ -9,6 +9,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import jaxlie
+import numpy as np
 import optax
 from jax import Array
 from jax.core import Tracer
@@ -19,16 +20,16 @@ from more2_jax.geometry.points import cloud_radius, farthest_points, transformed
 from more2_jax.geometry.se3_descent import adam, descend
 from more2_jax.geometry.transform import rescale, transform
 from more2_jax.network.prior import Prior, field_sdf, object_field
-from more2_jax.types import Embedding, JointFit, pytree, quantity
+from more2_jax.types import AnyArray, Embedding, JointFit, pytree, quantity
 
 
 @pytree
 class Observations:
     """One object, seen up to k times; every cloud in its own local frame. Row 0 is the reference."""
 
-    points: Float[Array, "*b k n 3"] = quantity("position")
-    mask: Bool[Array, "*b k n"] = quantity("invariant")
-    real: Bool[Array, "*b k"] = quantity("invariant")  # False: padding
+    points: Float[AnyArray, "*b k n 3"] = quantity("position")
+    mask: Bool[AnyArray, "*b k n"] = quantity("invariant")
+    real: Bool[AnyArray, "*b k"] = quantity("invariant")  # False: padding
     codes: Embedding = quantity("record")  # (*b, k, …): of every observation alone
     T_ref_obs: jaxlie.SE3 = quantity("pose")  # (*b, k): observation's local frame to the reference's
     accumulated: Embedding = quantity(
@@ -39,9 +40,11 @@ class Observations:
 def fit_jointly(prior: Prior, observations: Observations, config: JointConfig) -> JointFit:
     """Optimizes code and poses of a batch of objects in one call (paper §3.5); frame: the reference's local one.
 
-    Raises ValueError when an object has no reference observation.
+    Differentiable in both modes, with respect to points, poses, codes and weights. Raises ValueError when an object
+    has no reference observation, unless which observations are real is traced.
     """
-    if not isinstance(observations.real, Tracer) and not bool(observations.real[:, 0].all()):
+    # By NumPy: under `jax.jit` even an operation on a concrete array is traced, and has no truth value.
+    if not isinstance(observations.real, Tracer) and not np.asarray(observations.real)[:, 0].all():
         raise ValueError(
             "fit_jointly got an object without observation 0; needed the reference observation there"
         )
@@ -55,7 +58,7 @@ def _fit_many(prior: Prior, observations: Observations, config: JointConfig) -> 
 
 def fit_one(prior: Prior, seen: Observations, config: JointConfig) -> JointFit:
     """`fit_jointly` for one object, in units of the reference cloud's radius."""
-    seen = thin(seen, config.points)
+    seen = subsample(seen, config.points)
     radius = cloud_radius(seen.points[0], seen.mask[0])
     seen = rescale(seen, 1 / radius)
     start = seen.accumulated if config.start == "accumulated" else best_code(prior, seen)
@@ -63,7 +66,7 @@ def fit_one(prior: Prior, seen: Observations, config: JointConfig) -> JointFit:
 
     def loss(free: dict[str, Any]) -> Float[Array, ""]:
         code = dataclasses.replace(start, inv=free["inv"], eqv=free["eqv"], center=free["center"])
-        return surface_loss(prior, code, free["pose"], seen) + departure(code, start)
+        return surface_loss(prior, code, free["pose"], seen) + code_drift(code, start)
 
     best, lowest = descend(loss, free, optimizer(config), config.steps)
     # The reference observation defines the frame: all is moved back by what it drifted.
@@ -95,15 +98,15 @@ def surface_loss(
     """Σ over observations of the mean |Ψ| at their points; canonical units."""
     field = object_field(prior, code)
 
-    def one(T: jaxlie.SE3, points: Array, mask: Array, real: Array) -> Array:
+    def one(T: jaxlie.SE3, points: Any, mask: Any, real: Any) -> Array:
         distance = jnp.where(mask, jnp.abs(field_sdf(prior, field, transformed(T, points))), 0.0)
         return real * distance.sum() / jnp.maximum(mask.sum(), 1)
 
     return jax.vmap(one)(T_ref_obs, seen.points, seen.mask, seen.real).sum()
 
 
-def departure(code: Embedding, start: Embedding) -> Float[Array, ""]:
-    """‖F' − F_0‖₂: keeps the code from drifting to a field that is zero everywhere."""
+def code_drift(code: Embedding, start: Embedding) -> Float[Array, ""]:
+    """‖F' − F_0‖₂ (paper §3.5): keeps the code from a field that is zero everywhere."""
     squared = [jnp.sum((getattr(code, k) - getattr(start, k)) ** 2) for k in ("inv", "eqv", "center")]
     return jnp.sqrt(sum(squared, jnp.zeros(())) + 1e-16)
 
@@ -111,7 +114,7 @@ def departure(code: Embedding, start: Embedding) -> Float[Array, ""]:
 def best_code(prior: Prior, seen: Observations) -> Embedding:
     """X*: the code of the observation it explains best, moved into the reference's frame."""
 
-    def own_loss(code: Embedding, points: Array, mask: Array) -> Array:
+    def own_loss(code: Embedding, points: Any, mask: Any) -> Array:
         distance = jnp.abs(field_sdf(prior, object_field(prior, code), points))
         return jnp.where(mask, distance, 0.0).sum() / jnp.maximum(mask.sum(), 1)
 
@@ -121,7 +124,7 @@ def best_code(prior: Prior, seen: Observations) -> Embedding:
     return transform(code, T)
 
 
-def thin(seen: Observations, points: int) -> Observations:
-    """Every cloud in farthest-point order, at most `points`."""
+def subsample(seen: Observations, points: int) -> Observations:
+    """At most `points` farthest points of every cloud."""
     clouds, mask = jax.vmap(lambda p, m: farthest_points(p, m, points))(seen.points, seen.mask)
     return dataclasses.replace(seen, points=clouds, mask=mask)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
+from typing import Any
 
 import jax
-import jax.numpy as jnp
 import jaxlie
 import numpy as np
 
@@ -14,7 +14,6 @@ from more2_jax.config import SceneConfig
 from more2_jax.geometry.padding import bucket
 from more2_jax.geometry.poses import Pose, apply_pose, local_poses, world_poses
 from more2_jax.network.embedding_batch import (
-    SMALLEST_BATCH,
     embed,
     padded,
     stack,
@@ -47,7 +46,7 @@ def fit_objects(
     result = list(objects)
     if not chosen:
         return result
-    seen, origins = gather(prior, [objects[k] for k in chosen], config)
+    seen, origins = padded_observations(prior, [objects[k] for k in chosen], config)
     fit = jax.device_get(fit_jointly(prior, seen, config.joint))
     embeddings = unstack(fit.embedding, len(chosen))
     for n, k in enumerate(chosen):
@@ -57,42 +56,45 @@ def fit_objects(
         ]
         poses = [world_poses(T, origins[n, 0], origins[n, j]) for j, T in enumerate(local)]
         embedding = dataclasses.replace(embeddings[n], origin=origins[n, 0])
-        result[k] = dataclasses.replace(repose(objects[k], poses), embedding=embedding)
+        result[k] = dataclasses.replace(with_poses(objects[k], poses), embedding=embedding)
     return result
 
 
-def gather(
+def padded_observations(
     prior: Prior, objects: Sequence[SceneObject], config: SceneConfig
 ) -> tuple[Observations, np.ndarray]:
-    """Every accumulated observation as one batch (objects, observations, …), and their float64 origins."""
+    """Every accumulated observation as one batch (objects, observations, …), and their float64 origins.
+
+    Rows that are padding repeat an object's first observation, or the first object.
+    """
     most = bucket(max(len(accumulated(o)) for o in objects), 2)
-    count = bucket(len(objects), SMALLEST_BATCH)
-    rows = [[points_of(o, seen) for seen in accumulated(o)] for o in objects]
-    flat = [cloud for row in rows for cloud in [*row, *[row[0]] * (most - len(row))]]
-    cloud = padded(flat, smallest=SMALLEST_BATCH * most)
-    codes = encode(prior, cloud)
-    origins = np.asarray(cloud.origin).reshape(-1, most, 3)[:count]
     together, _ = stack([o.embedding for o in objects])
-    real, poses = np.zeros((count, most), bool), np.tile([1.0, 0, 0, 0, 0, 0, 0], (count, most, 1))
-    real[:, 0] = True
+    rows = [*objects, *[objects[0]] * (len(together.scale) - len(objects))]
+    clouds = [[points_of(o, seen) for seen in accumulated(o)] for o in rows]
+    # The j-th observations of all objects are one batch: as large as a scan's instances, whose program encodes it.
+    batches = [padded([row[j] if j < len(row) else row[0] for row in clouds]) for j in range(most)]
+    codes = [jax.device_get(encode(prior, batch)) for batch in batches]
+    origins = np.stack([np.asarray(batch.origin) for batch in batches], axis=1)
+    poses = np.tile([1.0, 0, 0, 0, 0, 0, 0], (len(rows), most, 1))
     for n, o in enumerate(objects):
         for j, seen in enumerate(accumulated(o)):
-            real[n, j], poses[n, j] = (
-                True,
-                local_poses(seen.T_ref_scan, origins[n, 0], origins[n, j]).wxyz_xyz,
-            )
-    split = lambda x: jnp.asarray(x).reshape(-1, most, *x.shape[1:])[:count]  # noqa: E731
+            poses[n, j] = local_poses(seen.T_ref_scan, origins[n, 0], origins[n, j]).wxyz_xyz
+    times_seen = np.array([len(accumulated(o)) for o in objects] + [1] * (len(rows) - len(objects)))
+
+    def side_by_side(*columns: Any) -> Any:
+        return jax.tree.map(lambda *x: np.stack(x, axis=1), *columns)
+
     return Observations(
-        points=split(cloud.points),
-        mask=split(cloud.mask),
-        real=jnp.asarray(real),
-        codes=jax.tree.map(split, dataclasses.replace(codes, origin=None)),
-        T_ref_obs=jaxlie.SE3(jnp.asarray(poses, jnp.float32)),
+        points=side_by_side(*[np.asarray(batch.points) for batch in batches]),
+        mask=side_by_side(*[np.asarray(batch.mask) for batch in batches]),
+        real=np.arange(most) < times_seen[:, None],  # type: ignore[arg-type]
+        codes=dataclasses.replace(side_by_side(*codes), origin=None),
+        T_ref_obs=jaxlie.SE3(poses.astype(np.float32)),  # type: ignore[arg-type]
         accumulated=about(together, origins[:, 0]),
     ), origins
 
 
-def repose(o: SceneObject, poses: Sequence[Pose]) -> SceneObject:
+def with_poses(o: SceneObject, poses: Sequence[Pose]) -> SceneObject:
     """The object with other poses of its accumulated observations, one each; its cloud follows."""
     points, posed = o.points.copy(), iter(poses)
     observations = []

@@ -11,15 +11,15 @@ from shapes import box_distance
 
 from more2_jax.config import MeshingConfig
 from more2_jax.meshing import extract as meshing
-from more2_jax.meshing.extract import extract_mesh, observed_level
+from more2_jax.meshing.extract import HALF_WIDTH, extract_mesh, observed_level
 from more2_jax.meshing.grid import cube
 from more2_jax.network.embedding_batch import embed
 from more2_jax.types import Embedding
 
 SCALE = 2.0  # meters per canonical unit
 CENTER, ORIGIN = np.array([0.1, -0.2, 0.05]), np.array([1000.0, -2000.0, 5.0])
-CONFIG = MeshingConfig(coarse=16, resolution=64)
-STEP = SCALE * 2 * CONFIG.half_width / CONFIG.resolution  # meters
+CONFIG = MeshingConfig(coarse_resolution=16, resolution=64)
+STEP = SCALE * 2 * HALF_WIDTH / CONFIG.resolution  # meters
 PIECE = Embedding(
     inv=np.zeros(4, np.float32),
     eqv=np.zeros((3, 4), np.float32),
@@ -66,7 +66,7 @@ def field_is(monkeypatch):
             asked.append(len(points))
             return jnp.asarray(field(canonical), jnp.float32)
 
-        monkeypatch.setattr(meshing, "_values", values)
+        monkeypatch.setattr(meshing, "_field_values", values)
         return asked
 
     return put
@@ -97,7 +97,7 @@ def test_level_by_level_equals_the_dense_grid_with_fewer_questions(field_is, tin
     asked = field_is(FIELDS[name][0])
     sparse = extract_mesh(tiny_prior, PIECE, CONFIG)
     few = sum(asked)
-    dense = extract_mesh(tiny_prior, PIECE, dataclasses.replace(CONFIG, coarse=64))
+    dense = extract_mesh(tiny_prior, PIECE, dataclasses.replace(CONFIG, coarse_resolution=64))
     assert sparse is not None and dense is not None
     for a, b in ((sparse, dense), (dense, sparse)):
         assert cKDTree(a.vertices).query(b.vertices)[0].max() < 1e-3 * STEP
@@ -113,7 +113,7 @@ def test_a_field_without_zero_has_no_surface(field_is, tiny_prior):
 def test_a_surface_that_leaves_the_box_is_closed_at_its_border(field_is, tiny_prior, resolution):
     field_is(lambda p: np.linalg.norm(p, axis=1) - 0.8)
     whole = solid(extract_mesh(tiny_prior, PIECE, dataclasses.replace(CONFIG, resolution=resolution)))
-    half = SCALE * (CONFIG.half_width + 2 * CONFIG.half_width / resolution)
+    half = SCALE * (HALF_WIDTH + 2 * HALF_WIDTH / resolution)
     assert whole.is_watertight and whole.volume > 0
     assert (np.abs(whole.vertices - CENTER) <= half + 1e-6).all()
 
@@ -122,7 +122,7 @@ def test_inside_everywhere_is_the_box_itself(field_is, tiny_prior):
     field_is(lambda p: np.full(len(p), -0.3))
     whole = solid(extract_mesh(tiny_prior, PIECE, CONFIG))
     assert whole.is_watertight
-    assert whole.volume == pytest.approx((2 * CONFIG.half_width * SCALE) ** 3, rel=0.1)
+    assert whole.volume == pytest.approx((2 * HALF_WIDTH * SCALE) ** 3, rel=0.1)
 
 
 def test_the_box_can_be_widened(field_is, tiny_prior):
@@ -149,9 +149,9 @@ def test_the_observed_level_is_the_median_at_the_points(field_is, tiny_prior):
 
 @pytest.mark.parametrize(("coarse", "resolution"), [(32, 48), (32, 16), (10, 64)])
 def test_a_resolution_not_reached_by_doubling_is_refused(tiny_prior, coarse, resolution):
-    config = MeshingConfig(coarse=coarse, resolution=resolution)
+    config = MeshingConfig(coarse_resolution=coarse, resolution=resolution)
     with pytest.raises(
-        ValueError, match=f"resolution {resolution} from coarse {coarse}; needed a power of two"
+        ValueError, match=f"resolution {resolution} from coarse_resolution {coarse}; needed a power of two"
     ):
         extract_mesh(tiny_prior, PIECE, config)
 
@@ -163,8 +163,8 @@ def test_the_decoder_itself_gives_a_closed_mesh_or_none(tiny_prior):
         inv=rng.normal(size=16).astype(np.float32),
         eqv=rng.normal(size=(3, 16)).astype(np.float32),
     )
-    config = MeshingConfig(coarse=8, resolution=16)
-    values = meshing._field(tiny_prior, code, 0.0, cube(8, config.half_width).corners())
+    config = MeshingConfig(coarse_resolution=8, resolution=16)
+    values = meshing._field(tiny_prior, code, 0.0, cube(8, HALF_WIDTH).corners())
     mesh = extract_mesh(tiny_prior, code, config, level=float(np.median(values)))
     assert mesh is not None and solid(mesh).is_watertight
     assert extract_mesh(tiny_prior, code, config, level=float(values.min()) - 10.0) is None
@@ -194,7 +194,7 @@ def test_a_field_asked_less_finely_is_interpolated(field_is, tiny_prior):
     asked.clear()
     some = extract_mesh(tiny_prior, PIECE, dataclasses.replace(CONFIG, field_resolution=32))
     assert sum(asked) < of_every / 2
-    step = 2 * CONFIG.half_width / 32
+    step = 2 * HALF_WIDTH / 32
     # A straight line between two points of a field of curvature c is at most c step² / 8 off, along three axes.
     most = 3 * step**2 / 8 / (0.4 - step)
     radius = np.linalg.norm(canonical(some), axis=1)
@@ -205,12 +205,11 @@ def test_a_field_asked_less_finely_is_interpolated(field_is, tiny_prior):
 def test_values_do_not_depend_on_how_many_are_asked_at_once(tiny_prior, monkeypatch):
     embedding = embed(tiny_prior, [np.random.default_rng(0).normal(size=(300, 3))])[0]
     queries = np.random.default_rng(1).uniform(-0.5, 0.5, (3000, 3))
-    few = meshing._in_chunks(meshing._values, tiny_prior, embedding, queries[:100])
-    turns = meshing._in_chunks(meshing._values, tiny_prior, embedding, queries)
-    monkeypatch.setattr(meshing, "CHUNK", {})
-    monkeypatch.setattr(meshing, "CHUNK_OF_OTHERS", 4096)
+    few = meshing._in_chunks(meshing._field_values, tiny_prior, embedding, queries[:100])
+    turns = meshing._in_chunks(meshing._field_values, tiny_prior, embedding, queries)
+    monkeypatch.setattr(meshing, "CHUNK", 4096)
     once = meshing._in_chunks(
-        meshing._values, tiny_prior, embedding, queries
+        meshing._field_values, tiny_prior, embedding, queries
     )  # 4096 rows instead of twice 2048
     assert once.shape == turns.shape == (3000,) and np.ptp(once) > 1e-3
     np.testing.assert_allclose(once, turns, atol=1e-6)

@@ -5,7 +5,7 @@ import pytest
 from scipy.ndimage import zoom
 from scipy.spatial import cKDTree
 
-from more2_jax.meshing.grid import Level, cube, doubled, near_surface
+from more2_jax.meshing.grid import GridField, cube, surface_cells, upsampled
 
 
 def test_a_cube_reaches_from_end_to_end_and_keeps_its_corners_when_finer():
@@ -25,7 +25,7 @@ def test_every_corner_so_near_to_a_point_is_near(distance):
     points = points[np.abs(points).max(axis=1) < 0.5]
     corners = lattice.corners()
     apart = cKDTree(points).query(corners)[0]
-    near = lattice.near(points, distance).ravel()
+    near = lattice.corners_near(points, distance).ravel()
     assert near[apart <= distance].all()
     assert (apart[near] <= np.sqrt(3) * (distance + 2 * lattice.step)).all()
 
@@ -35,7 +35,7 @@ def test_a_box_holds_what_is_kept_and_its_margin(margin):
     lattice = cube(20, 0.5)
     values = np.random.default_rng(0).normal(size=lattice.shape)
     kept = np.linalg.norm(lattice.corners() - [0.2, 0, -0.1], axis=1).reshape(lattice.shape) < 0.15
-    level = Level(lattice, values, 2 * values).around(kept, margin)
+    level = GridField(lattice, values, 2 * values).around(kept, margin)
     assert level.field.shape == level.values.shape == level.lattice.shape
     held, whole = level.lattice.corners(), lattice.corners()
     wanted = np.abs(whole - [0.2, 0, -0.1]).max(axis=1) < 0.15 - lattice.step + margin
@@ -48,18 +48,18 @@ def test_a_box_holds_what_is_kept_and_its_margin(margin):
 
 def test_the_box_of_nothing_is_all():
     lattice = cube(4, 0.5)
-    level = Level(lattice, np.ones(lattice.shape), np.ones(lattice.shape))
+    level = GridField(lattice, np.ones(lattice.shape), np.ones(lattice.shape))
     assert level.around(np.zeros(lattice.shape, bool), 0.1) is level
 
 
 def test_cells_that_the_surface_may_pass_are_looked_into():
     axis = np.linspace(-1, 1, 9)
     grid = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1)
-    near = near_surface(np.linalg.norm(grid - [0.1, 0.1, 0.1], axis=-1) - 0.05, 0.25)  # between all corners
+    near = surface_cells(np.linalg.norm(grid - [0.1, 0.1, 0.1], axis=-1) - 0.05, 0.25)  # between all corners
     assert near[4, 4, 4]
     assert not near[0].any() and near.sum() < 30
 
 
 def test_half_the_step_is_linear_interpolation():
     x = np.random.default_rng(0).normal(size=(5, 5, 5))
-    np.testing.assert_allclose(doubled(x), zoom(x, 9 / 5, order=1, grid_mode=False), atol=1e-12)
+    np.testing.assert_allclose(upsampled(x), zoom(x, 9 / 5, order=1, grid_mode=False), atol=1e-12)

@@ -3,10 +3,20 @@
 import numpy as np
 import pytest
 import trimesh
+from scipy.sparse.linalg import spsolve
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
-from more2_jax.meshing.normal_orientation import FARTHEST, VOTERS, first_met, outward_signs, side_seen
+from more2_jax.meshing.normal_orientation import (
+    MAX_DISTANCE,
+    MAX_VOTERS,
+    conjugate_gradients,
+    free_distance,
+    nearest_neighbors,
+    outward_signs,
+    sensor_votes,
+    signed_graph,
+)
 
 GAP = 0.05
 
@@ -79,16 +89,29 @@ def test_turning_everything_changes_nothing():
 def test_the_first_point_met_is_told_to_a_third():
     points = np.array([[0.0, 0, 0], [0.0, 0, 0.4]])
     tree = KDTree(points)
-    up = first_met(tree, points, np.tile([0.0, 0, 1], (2, 1)), GAP, -np.inf)
+    up = free_distance(tree, points, np.tile([0.0, 0, 1], (2, 1)), GAP, -np.inf)
     assert 0.27 < up[0] < 0.53 and up[1] == 1.0
-    down = first_met(tree, points, np.tile([0.0, 0, -1], (2, 1)), GAP, -np.inf)
+    down = free_distance(tree, points, np.tile([0.0, 0, -1], (2, 1)), GAP, -np.inf)
     assert down[0] == 1.0 and 0.27 < down[1] < 0.53
-    assert FARTHEST < 1.0
+    assert MAX_DISTANCE < 1.0
 
 
 def test_points_on_one_spot_are_no_error():
     found = outward_signs(KDTree(np.zeros((30, 3))), np.tile([0.0, 0, 1], (30, 1)), np.ones(30), GAP, -np.inf)
     assert set(found) <= {-1.0, 1.0}
+
+
+def test_the_votes_are_the_linear_system_s_solution():
+    points, true = surface_of(shelf(), 2000)
+    normals, sign = flipped(true)
+    vote = sign + 2 * np.random.default_rng(0).normal(size=len(sign))
+    matrix, right = signed_graph(points, normals, vote, nearest_neighbors(KDTree(points)))
+    np.testing.assert_allclose((matrix - matrix.T).toarray(), 0, atol=1e-12)
+    exact = spsolve(matrix.tocsc(), right)
+    found = conjugate_gradients(matrix, right, vote)
+    assert np.linalg.norm(matrix @ found - right) <= 1e-3 * np.linalg.norm(right)
+    assert ((found < 0) == (exact < 0))[np.abs(exact) > 0.01 * np.abs(exact).max()].all()
+    np.testing.assert_array_equal(conjugate_gradients(matrix, right, exact), exact)  # nothing is left to do
 
 
 def from_places(points, *places):
@@ -105,7 +128,7 @@ def test_a_surface_faces_its_only_sensor():
     points, up = sheet()
     normals, sign = flipped(up)
     for height in (2.0, -2.0):
-        seen = side_seen(KDTree(points), points, normals, from_places(points, [0.3, 0.1, height]), GAP)
+        seen = sensor_votes(KDTree(points), points, normals, from_places(points, [0.3, 0.1, height]), GAP)
         np.testing.assert_array_equal(seen, np.sign(height) * sign)
 
 
@@ -114,7 +137,7 @@ def test_what_is_hidden_from_a_sensor_was_seen_by_another():
     (above, up), (below, _) = sheet(0.1), sheet(-0.1)
     points = np.concatenate([above, below])
     places = from_places(points, [0.0, 0, 2.0], [0.0, 0, -2.0])
-    seen = side_seen(KDTree(points), points, np.concatenate([up, up]), places, GAP)
+    seen = sensor_votes(KDTree(points), points, np.concatenate([up, up]), places, GAP)
     inner = np.abs(points[:, :2]).max(axis=1) < 0.3
     assert (seen[: len(above)][inner[: len(above)]] == 1).all()
     assert (seen[len(above) :][inner[len(above) :]] == -1).all()
@@ -122,22 +145,22 @@ def test_what_is_hidden_from_a_sensor_was_seen_by_another():
 
 def test_sensors_that_nothing_hides_on_both_sides_say_nothing():
     points, up = sheet()
-    seen = side_seen(KDTree(points), points, up, from_places(points, [0.0, 0, 2.0], [0.0, 0, -2.0]), GAP)
+    seen = sensor_votes(KDTree(points), points, up, from_places(points, [0.0, 0, 2.0], [0.0, 0, -2.0]), GAP)
     np.testing.assert_allclose(seen, 0.0, atol=1e-12)
 
 
 def test_unknown_places_and_a_sensor_at_the_point_say_nothing():
     points, up = sheet()
     nowhere = np.full((len(points), 2, 3), np.nan)
-    assert not side_seen(KDTree(points), points, up, nowhere, GAP).any()
-    assert not side_seen(KDTree(points), points, up, points[:, None], GAP).any()
+    assert not sensor_votes(KDTree(points), points, up, nowhere, GAP).any()
+    assert not sensor_votes(KDTree(points), points, up, points[:, None], GAP).any()
     filled = nowhere.copy()
     filled[:, 1] = [0.0, 0, 2.0]
-    assert (side_seen(KDTree(points), points, up, filled, GAP) == 1).all()
+    assert (sensor_votes(KDTree(points), points, up, filled, GAP) == 1).all()
 
 
 def test_of_many_points_some_look_around_and_the_rest_hears_them():
-    points, true = surface_of(shelf(), 3 * VOTERS)
+    points, true = surface_of(shelf(), 3 * MAX_VOTERS)
     normals, sign = flipped(true)
     assert (outward_signs(KDTree(points), normals, 0.0 * sign, GAP, -np.inf) == sign).mean() > 0.95
 

@@ -11,14 +11,14 @@ from scipy.spatial.transform import Rotation
 
 from more2_jax.config import MeshingConfig
 from more2_jax.meshing import extract as meshing
-from more2_jax.meshing.extract import extract_mesh
+from more2_jax.meshing.extract import HALF_WIDTH, extract_mesh
 from more2_jax.meshing.grid import cube
-from more2_jax.meshing.observed_surface import FEWEST, MOST, seen_surface, some_of
-from more2_jax.meshing.planes import planes_of
+from more2_jax.meshing.observed_surface import MAX_POINTS, MIN_POINTS, fit_observed_surface, uniform_subsample
+from more2_jax.meshing.planes import fit_planes
 from more2_jax.types import Embedding
 
 REACH = 0.03
-CONFIG = MeshingConfig(coarse=16, resolution=64, seen_reach=REACH)
+CONFIG = MeshingConfig(coarse_resolution=16, resolution=64, mls_bandwidth=REACH)
 PIECE = Embedding(
     inv=np.zeros(4, np.float32),
     eqv=np.zeros((3, 4), np.float32),
@@ -55,8 +55,8 @@ def ball_of_036(monkeypatch):
         q = offset(embedding, points)
         return jnp.asarray(q / np.maximum(np.linalg.norm(q, axis=1, keepdims=True), 1e-9), jnp.float32)
 
-    monkeypatch.setattr(meshing, "_values", values)
-    monkeypatch.setattr(meshing, "_slopes", slopes)
+    monkeypatch.setattr(meshing, "_field_values", values)
+    monkeypatch.setattr(meshing, "_field_gradients", slopes)
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.005])
@@ -75,12 +75,14 @@ def test_the_mesh_runs_through_what_was_seen_and_follows_the_field_elsewhere(bal
     )
     found = trimesh.Trimesh(p, mesh.faces, process=False).sample(20_000, seed=0)
     assert cKDTree(found).query(upper)[0].max() < 0.03
-    alone = extract_mesh(tiny_prior, PIECE, MeshingConfig(coarse=16, resolution=64), seen=in_scan(seen))
+    alone = extract_mesh(
+        tiny_prior, PIECE, MeshingConfig(coarse_resolution=16, resolution=64), seen=in_scan(seen)
+    )
     np.testing.assert_allclose(np.linalg.norm(in_canonical(alone.vertices), axis=1), 0.36, atol=0.005)
 
 
 def test_too_few_points_leave_the_field_alone(ball_of_036, tiny_prior):
-    seen = in_scan(sphere(FEWEST - 1, 0.4))
+    seen = in_scan(sphere(MIN_POINTS - 1, 0.4))
     mesh = extract_mesh(tiny_prior, PIECE, CONFIG, seen=seen)
     np.testing.assert_allclose(np.linalg.norm(in_canonical(mesh.vertices), axis=1), 0.36, atol=0.005)
 
@@ -88,7 +90,7 @@ def test_too_few_points_leave_the_field_alone(ball_of_036, tiny_prior):
 def test_on_a_plane_the_distance_is_the_offset_and_far_away_the_field():
     rng = np.random.default_rng(0)
     points = np.column_stack([rng.uniform(-0.4, 0.4, (3000, 2)), np.full(3000, 0.1)])
-    surface = seen_surface(points, np.tile([0.0, 0.2, 3.0], (3000, 1)), REACH)
+    surface = fit_observed_surface(points, np.tile([0.0, 0.2, 3.0], (3000, 1)), REACH)
     height = np.array([-0.01, 0.0, 0.01, 0.3])
     queries = np.column_stack([np.zeros((4, 2)), 0.1 + height])
     found = surface.corrected(queries, np.full(4, 0.7))
@@ -103,7 +105,7 @@ def test_of_an_open_sheet_the_field_says_which_side_is_inside():
     points = np.column_stack([rng.uniform(-0.4, 0.4, (2000, 2)), np.zeros(2000)])
     up = np.tile([0.0, 0.0, 1.0], (2000, 1))
     queries, far = rng.uniform(-0.3, 0.3, (200, 3)) * [1, 1, 0.03], np.zeros(200)
-    out, inward = (seen_surface(points, s * up, REACH).corrected(queries, far) for s in (1, -1))
+    out, inward = (fit_observed_surface(points, s * up, REACH).corrected(queries, far) for s in (1, -1))
     np.testing.assert_allclose(out, -inward, atol=1e-12)
     assert (np.sign(out) == np.sign(queries[:, 2])).all()
 
@@ -111,7 +113,9 @@ def test_of_an_open_sheet_the_field_says_which_side_is_inside():
 def test_of_a_closed_body_the_points_say_it_whatever_the_field_does():
     points, queries = sphere(2000, 0.3), sphere(200, 0.31, seed=5)
     for field in (1.0, -1.0):
-        assert (seen_surface(points, field * points, REACH).corrected(queries, np.zeros(200)) > 0).all()
+        assert (
+            fit_observed_surface(points, field * points, REACH).corrected(queries, np.zeros(200)) > 0
+        ).all()
 
 
 def test_turning_everything_changes_nothing():
@@ -121,8 +125,8 @@ def test_turning_everything_changes_nothing():
         np.random.default_rng(2).uniform(-0.4, 0.4, (500, 3)),
     )
     slope, field = points / [1.0, 0.49, 0.16], np.linspace(-1, 1, 500)
-    here = seen_surface(points, slope, REACH).corrected(queries, field)
-    turned = seen_surface(points @ R.T, slope @ R.T, REACH).corrected(queries @ R.T, field)
+    here = fit_observed_surface(points, slope, REACH).corrected(queries, field)
+    turned = fit_observed_surface(points @ R.T, slope @ R.T, REACH).corrected(queries @ R.T, field)
     np.testing.assert_allclose(turned, here, atol=1e-6)  # planes are single precision
     assert (here != field).any() and (here == field).any()
 
@@ -133,16 +137,16 @@ def test_turning_everything_changes_nothing():
     ids=["one point", "three points", "a line"],
 )
 def test_points_without_a_plane_give_finite_values(points):
-    surface = seen_surface(points, np.ones_like(points), REACH)
+    surface = fit_observed_surface(points, np.ones_like(points), REACH)
     values = surface.corrected(np.random.default_rng(0).uniform(-1, 1, (100, 3)), np.ones(100))
     assert np.isfinite(values).all()
 
 
 def test_at_most_so_many_points_are_kept_from_first_to_last():
-    points = np.arange(3 * (MOST + 5000.0)).reshape(-1, 3)
-    kept = some_of(points)
-    assert len(kept) == MOST and (kept[[0, -1]] == points[[0, -1]]).all()
-    np.testing.assert_array_equal(some_of(points[:10]), points[:10])
+    points = np.arange(3 * (MAX_POINTS + 5000.0)).reshape(-1, 3)
+    kept = uniform_subsample(points)
+    assert len(kept) == MAX_POINTS and (kept[[0, -1]] == points[[0, -1]]).all()
+    np.testing.assert_array_equal(uniform_subsample(points[:10]), points[:10])
 
 
 def test_what_was_seen_is_drawn_finer_than_the_field_is_asked(ball_of_036, tiny_prior):
@@ -150,7 +154,7 @@ def test_what_was_seen_is_drawn_finer_than_the_field_is_asked(ball_of_036, tiny_
     radius = 0.37 + 0.01 * np.sin(
         8 * np.arctan2(waves[:, 1], waves[:, 0])
     )  # a wave is 0.3 long: 4 of 16 cells
-    config = MeshingConfig(coarse=16, resolution=64, field_resolution=16, seen_reach=REACH)
+    config = MeshingConfig(coarse_resolution=16, resolution=64, field_resolution=16, mls_bandwidth=REACH)
     mesh = extract_mesh(tiny_prior, PIECE, config, seen=in_scan(waves * radius[:, None]))
     p = in_canonical(mesh.vertices)
     p = p[np.abs(p[:, 2]) < 0.2]
@@ -162,27 +166,27 @@ def test_what_was_seen_is_drawn_finer_than_the_field_is_asked(ball_of_036, tiny_
 
 
 def test_every_corner_that_is_drawn_is_near():
-    surface = seen_surface(
+    surface = fit_observed_surface(
         sphere(2000, 0.3) + [0.25, 0, 0], sphere(2000, 0.3), REACH
     )  # partly beyond the grid
     lattice = cube(36, 0.45)
-    near, corners = lattice.near(surface.points, surface.farthest), lattice.corners()
+    near, corners = lattice.corners_near(surface.points, surface.cutoff), lattice.corners()
     drawn = surface.corrected(corners, np.full(len(corners), 5.0)) != 5.0
     assert drawn.any() and near.ravel()[drawn].all() and near.mean() < 0.5
 
 
 @pytest.mark.parametrize(("noise", "finer"), [(0.0, True), (0.02, False)])
 def test_a_grid_is_as_fine_as_the_points_are_exact(ball_of_036, tiny_prior, noise, finer, monkeypatch):
-    grids, sided = [], meshing._sided
+    grids, sided = [], meshing._screened
 
     def noted(*asked):
         found = sided(*asked)
-        grids.append(round(2 * CONFIG.half_width / found.lattice.step))
+        grids.append(round(2 * HALF_WIDTH / found.lattice.step))
         return found
 
-    monkeypatch.setattr(meshing, "_sided", noted)
+    monkeypatch.setattr(meshing, "_screened", noted)
     seen = sphere(6000, 0.4) * (1 + noise * np.random.default_rng(0).normal(size=(6000, 1)))
-    config = dataclasses.replace(CONFIG, resolution=64, field_resolution=16, screening=0.1)
+    config = dataclasses.replace(CONFIG, resolution=64, field_resolution=16, screening_length=0.1)
     mesh = extract_mesh(tiny_prior, PIECE, config, seen=in_scan(seen))
     assert grids == [64 if finer else 32]
     radius = np.linalg.norm(in_canonical(mesh.vertices), axis=1)
@@ -205,10 +209,10 @@ def leg(noise=0.0):
 
 def test_exact_points_beside_an_edge_face_as_their_side_does():
     points, outward = leg()
-    found = seen_surface(points, points * [1, 1, 0], REACH)
-    assert found.exact and (found.center == points).all()
+    found = fit_observed_surface(points, points * [1, 1, 0], REACH)
+    assert found.noiseless and (found.center == points).all()
     faces = np.einsum("ni,ni->n", found.normal, outward)
-    plain = planes_of(points, found.neighbors).normal
+    plain = fit_planes(points, found.neighbors).normal
     assert np.mean(faces > 0.99) > 0.97 > 0.9 > np.mean(np.abs(np.einsum("ni,ni->n", plain, outward)) > 0.99)
 
 
@@ -220,18 +224,18 @@ def test_along_scan_lines_neighbors_of_one_line_make_no_plane():
     outward = np.repeat([[0.0, 0, 1], [0, -1, 0]], along.size, axis=0)
     R = Rotation.random(random_state=0).as_matrix()  # no axis of the frame is a normal by chance
     points, outward = points @ R.T, outward @ R.T
-    found = seen_surface(points, outward, REACH)
-    assert found.exact
+    found = fit_observed_surface(points, outward, REACH)
+    assert found.noiseless
     faces = np.einsum("ni,ni->n", found.normal, outward)
-    nearest = np.abs(np.einsum("ni,ni->n", planes_of(points, found.neighbors[:, :6]).normal, outward))
+    nearest = np.abs(np.einsum("ni,ni->n", fit_planes(points, found.neighbors[:, :6]).normal, outward))
     assert np.mean(faces > 0.99) > 0.9 > 0.7 > np.mean(nearest > 0.99)
 
 
 def test_of_noisy_points_planes_stay_means():
     points, _ = leg(noise=0.003)
-    found = seen_surface(points, points * [1, 1, 0], REACH)
-    plain = planes_of(points, found.neighbors)
-    assert not found.exact and (found.center == plain.center).all()
+    found = fit_observed_surface(points, points * [1, 1, 0], REACH)
+    plain = fit_planes(points, found.neighbors)
+    assert not found.noiseless and (found.center == plain.center).all()
     np.testing.assert_allclose(np.abs(np.einsum("ni,ni->n", found.normal, plain.normal)), 1.0, rtol=1e-6)
 
 
@@ -247,7 +251,7 @@ def test_a_sheet_faces_who_saw_it_whatever_the_field_says(eye, outward):
     places = np.full((len(points), 2, 3), np.nan)
     places[:, 0] = eye
     for field in (1.0, -1.0):
-        found = seen_surface(points, field * points, REACH, seen_from=places)
+        found = fit_observed_surface(points, field * points, REACH, sensors=places)
         facing = outward * np.einsum("ni,ni->n", found.normal, points) > 0
         assert facing.mean() > 0.99
 
@@ -255,7 +259,7 @@ def test_a_sheet_faces_who_saw_it_whatever_the_field_says(eye, outward):
 def test_a_mesh_is_told_who_saw_its_points(ball_of_036, tiny_prior):
     """A shell that the field takes for a ball: seen from within, its inside is free."""
     within = sphere(4000, 0.3)
-    config = dataclasses.replace(CONFIG, field_resolution=32, screening=0.15)
+    config = dataclasses.replace(CONFIG, field_resolution=32, screening_length=0.15)
     places = np.broadcast_to(in_scan(np.zeros(3)), (len(within), 1, 3))
     shell = extract_mesh(tiny_prior, PIECE, config, seen=in_scan(within), seen_from=places)
     whole = extract_mesh(tiny_prior, PIECE, config, seen=in_scan(within))
@@ -267,7 +271,9 @@ def test_a_mesh_is_told_who_saw_its_points(ball_of_036, tiny_prior):
 @pytest.mark.parametrize(("noise", "solid"), [(0.0, False), (0.01, True)])
 def test_sides_of_exact_points_of_several_scans_reach_farther(ball_of_036, tiny_prior, noise, solid):
     within = sphere(4000, 0.3) * (1 + noise * np.random.default_rng(0).normal(size=(4000, 1)))
-    config = dataclasses.replace(CONFIG, field_resolution=32, screening=0.03, screening_of_many=0.15)
+    config = dataclasses.replace(
+        CONFIG, field_resolution=32, screening_length=0.03, screening_length_multi_scan=0.15
+    )
     places = np.broadcast_to(in_scan(np.zeros(3)), (len(within), 1, 3))
     mesh = extract_mesh(tiny_prior, PIECE, config, seen=in_scan(within), seen_from=places)
     middle = in_scan(np.zeros((1, 3)))

@@ -5,8 +5,8 @@ import pytest
 from scipy.spatial import KDTree
 from shapes import box_distance
 
-from more2_jax.meshing.grid import Level, cube
-from more2_jax.meshing.screened_poisson import SOFT, areas, screened, splat
+from more2_jax.meshing.grid import GridField, cube
+from more2_jax.meshing.screened_poisson import TRANSITION_CELLS, screened_poisson, splat, surface_areas
 
 N, HALF, LENGTH = 49, 0.6, 0.1
 LATTICE = cube(N - 1, HALF)
@@ -30,7 +30,7 @@ def board(height, face, count=2500):
 
 def test_right_points_leave_a_right_field_as_it_is():
     field = np.linalg.norm(GRID, axis=-1) - 0.35
-    found = screened(field, LATTICE, *sphere(), LENGTH)
+    found = screened_poisson(field, LATTICE, *sphere(), LENGTH)
     assert ((found < 0) == (field < 0))[np.abs(field) > 1.5 * STEP].mean() > 0.999
     near = np.abs(field) < 0.5 * STEP
     np.testing.assert_allclose(found[near], field[near], atol=0.6 * STEP)
@@ -41,7 +41,7 @@ def test_points_hollow_out_what_the_field_takes_for_solid():
     block = box_distance(GRID.reshape(-1, 3), np.array([0.4, 0.4, 0.1])).reshape(N, N, N)
     faces = [board(0.1, 1), board(0.05, -1), board(-0.05, 1), board(-0.1, -1)]
     points, normals, area = (np.concatenate(x) for x in zip(*faces, strict=True))
-    found = screened(block, LATTICE, points, normals, area, 0.15)
+    found = screened_poisson(block, LATTICE, points, normals, area, 0.15)
     inner = np.abs(GRID[..., :2]).max(axis=-1) < 0.3
     height = np.abs(GRID[..., 2])
     between, within = inner & (height < 0.03), inner & (np.abs(height - 0.075) < 0.005)
@@ -54,7 +54,7 @@ def test_far_from_points_the_field_stays_and_near_them_it_follows():
     """A ball seen from above only, and believed smaller."""
     points, normals, area = (x[sphere()[0][:, 2] > 0.2] for x in sphere())
     field = np.linalg.norm(GRID, axis=-1) - 0.32
-    found = screened(field, LATTICE, points, normals, area, 0.1)
+    found = screened_poisson(field, LATTICE, points, normals, area, 0.1)
     far = (GRID[..., 2] < -0.15) & (np.abs(field) > STEP)
     assert ((found < 0) == (field < 0))[far].all()
     pole = found[N // 2, N // 2, N // 2 :]
@@ -63,9 +63,9 @@ def test_far_from_points_the_field_stays_and_near_them_it_follows():
 
 
 def test_no_points_no_change():
-    field = np.clip(np.linalg.norm(GRID, axis=-1) - 0.35, -SOFT * STEP, SOFT * STEP)
+    field = np.clip(np.linalg.norm(GRID, axis=-1) - 0.35, -TRANSITION_CELLS * STEP, TRANSITION_CELLS * STEP)
     points, normals, area = (x[:1] * 0 for x in sphere())
-    found = screened(field, LATTICE, points, normals, area, 0.01)  # screened by far less than a cell
+    found = screened_poisson(field, LATTICE, points, normals, area, 0.01)  # screened by far less than a cell
     assert ((found < 0) == (field < 0))[np.abs(field) > 0.5 * STEP].all()
 
 
@@ -73,18 +73,18 @@ def test_order_does_not_matter():
     field = np.full((N, N, N), 0.2)
     points, normals, area = sphere()
     shuffled = np.random.default_rng(3).permutation(len(points))
-    one = screened(field, LATTICE, points, normals, area, LENGTH)
-    other = screened(field, LATTICE, points[shuffled], normals[shuffled], area[shuffled], LENGTH)
+    one = screened_poisson(field, LATTICE, points, normals, area, LENGTH)
+    other = screened_poisson(field, LATTICE, points[shuffled], normals[shuffled], area[shuffled], LENGTH)
     np.testing.assert_allclose(one, other, atol=1e-12)
 
 
 def test_a_box_cut_out_of_the_grid_gives_the_same_within():
     """What lies a screening length off the points and the inside hardly matters."""
     field = np.linalg.norm(GRID, axis=-1) - 0.32
-    whole = screened(field, LATTICE, *sphere(), LENGTH)
-    level = Level(LATTICE, field, field).around(field < 0.03, LENGTH)
+    whole = screened_poisson(field, LATTICE, *sphere(), LENGTH)
+    level = GridField(LATTICE, field, field).around(field < 0.03, LENGTH)
     assert level.field.size < 0.9 * field.size
-    cut = screened(level.field, level.lattice, *sphere(), LENGTH)
+    cut = screened_poisson(level.field, level.lattice, *sphere(), LENGTH)
     first = np.rint((level.lattice.low + HALF) / STEP).astype(int)
     same = whole[tuple(slice(a, a + n) for a, n in zip(first, cut.shape, strict=True))]
     np.testing.assert_allclose(cut, same, atol=0.05 * STEP)
@@ -105,11 +105,11 @@ def test_splat_keeps_the_sum_and_the_mean_and_leaves_out_what_is_outside():
 
 def test_areas_sum_to_the_surface_and_the_other_face_of_a_board_does_not_count():
     points, normals, _ = sphere()
-    assert areas(points, normals, *KDTree(points).query(points, k=12)).sum() == pytest.approx(
+    assert surface_areas(points, normals, *KDTree(points).query(points, k=12)).sum() == pytest.approx(
         4 * np.pi * 0.35**2, rel=0.15
     )
     top, under = board(0.004, 1), board(0.0, -1)
     points, normals = (np.concatenate([a, b]) for a, b in zip(top[:2], under[:2], strict=True))
-    assert areas(points, normals, *KDTree(points).query(points, k=12)).sum() == pytest.approx(
+    assert surface_areas(points, normals, *KDTree(points).query(points, k=12)).sum() == pytest.approx(
         2 * 0.64, rel=0.2
     )

@@ -16,7 +16,7 @@ from more2_jax.geometry.padding import pad_clouds
 from more2_jax.geometry.transform import rescale, transform
 from more2_jax.network.prior import encode
 from more2_jax.refinement import joint
-from more2_jax.refinement.joint import Observations, departure, fit_jointly, surface_loss
+from more2_jax.refinement.joint import Observations, code_drift, fit_jointly, surface_loss
 
 POINTS, OBJECTS, SEEN = 128, 3, 4  # every object seen three times, and one row of padding
 CONFIG = JointConfig(
@@ -87,7 +87,7 @@ def test_no_step_is_the_loss_of_the_start_by_definition(tiny_prior, seen, start)
     config = dataclasses.replace(CONFIG, steps=0, start=start)
     fit, loss_of = fit_jointly(tiny_prior, seen, config), quick_jit(surface_loss)
     for n in range(OBJECTS):
-        one = joint.thin(jax.tree.map(lambda x, n=n: x[n], seen), POINTS)
+        one = joint.subsample(jax.tree.map(lambda x, n=n: x[n], seen), POINTS)
         radius = joint.cloud_radius(one.points[0], one.mask[0])
         one = rescale(one, 1 / radius)
         starts = [one.accumulated]
@@ -151,13 +151,13 @@ def test_an_object_without_reference_is_refused(tiny_prior, seen):
         fit_jointly(tiny_prior, dataclasses.replace(seen, real=seen.real.at[1, 0].set(False)), CONFIG)
 
 
-def test_no_departure_costs_nothing_and_has_a_finite_gradient(seen):
+def test_no_code_drift_costs_nothing_and_has_a_finite_gradient(seen):
     code = jax.tree.map(lambda x: x[0], seen.accumulated)
-    assert float(departure(code, code)) < 1e-6
-    gradient = jax.grad(lambda x: departure(dataclasses.replace(code, inv=x), code))(code.inv)
+    assert float(code_drift(code, code)) < 1e-6
+    gradient = jax.grad(lambda x: code_drift(dataclasses.replace(code, inv=x), code))(code.inv)
     assert bool(jnp.isfinite(gradient).all())
     further = dataclasses.replace(code, inv=code.inv + 3.0 / np.sqrt(len(code.inv)))
-    assert float(departure(further, code)) == pytest.approx(3.0, rel=1e-4)
+    assert float(code_drift(further, code)) == pytest.approx(3.0, rel=1e-4)
 
 
 @pytest.mark.parametrize("factor", [0.01, 1.0, 100.0])
@@ -176,3 +176,85 @@ def test_moving_the_code_is_encoding_what_was_moved(tiny_prior, factor):
     # Random weights put the center far off; "relative" means to its length.
     length = float(np.linalg.norm(expected.center))
     np.testing.assert_allclose(after.center + after.origin, expected.center, atol=1e-4 * length)
+
+
+@pytest.fixture
+def in_float64(tiny_prior, seen):
+    """Prior and an object seen three times in double precision; what is real and masked stays on the host, in NumPy."""
+
+    def exact(tree):
+        floats = lambda x: jnp.issubdtype(x.dtype, jnp.floating)  # noqa: E731
+        return jax.tree.map(lambda x: jnp.asarray(np.asarray(x), float if floats(x) else x.dtype), tree)
+
+    with jax.enable_x64(True):
+        prior, few = exact(
+            (tiny_prior, jax.tree.map(lambda x: x[:1, :3], dataclasses.replace(seen, accumulated=seen.codes)))
+        )
+        # Views of a piece differ: were they one cloud, each of their codes would be the best as well as the others.
+        noise = 0.01 * np.random.default_rng(0).normal(size=few.points[:, :, :32].shape)
+        few = dataclasses.replace(
+            few,
+            points=few.points[:, :, :32] + noise,
+            mask=np.asarray(few.mask[:, :, :32]),
+            real=np.asarray(few.real),
+        )
+        yield prior, few
+
+
+def outcome(prior, observations, config, points, pose, code):
+    """A number that all results go into, of what is added to points, poses (tangent) and codes."""
+    codes = observations.codes
+    codes = dataclasses.replace(codes, inv=codes.inv + code, eqv=codes.eqv + code[..., None, :])
+    given = dataclasses.replace(
+        observations,
+        points=observations.points + points,
+        T_ref_obs=jaxlie.manifold.rplus(observations.T_ref_obs, pose),
+        codes=codes,
+        accumulated=jax.tree.map(lambda x: x[:, 0], codes),
+    )
+    fit = fit_jointly(prior, given, config)
+    weights = np.random.default_rng(0).normal(size=fit.T_ref_obs.wxyz_xyz.shape)
+    code = fit.embedding
+    return (
+        fit.loss.sum() + (weights * fit.T_ref_obs.wxyz_xyz).sum() + code.inv.sum() + 2 * code.eqv[:, 0].sum()
+    )
+
+
+def test_derivatives_in_both_modes_are_those_of_central_differences(in_float64):
+    prior, observations = in_float64
+    config = dataclasses.replace(CONFIG, steps=3, points=24)
+    rng = np.random.default_rng(1)
+    points, pose, code = (
+        rng.normal(size=shape)
+        for shape in (observations.points.shape, (*observations.real.shape, 6), observations.codes.inv.shape)
+    )
+
+    def along(t):
+        """`outcome` as far as t along three random directions."""
+        return outcome(prior, observations, config, t[0] * points, t[1] * pose, t[2] * code)
+
+    value, zero, step = quick_jit(along), jnp.zeros(3), 1e-6
+    differences = [(value(step * e) - value(-step * e)) / (2 * step) for e in np.eye(3)]
+    assert np.abs(differences).min() > 1e-3
+    np.testing.assert_allclose(quick_jit(jax.grad(along))(zero), differences, rtol=1e-5)
+    np.testing.assert_allclose(quick_jit(jax.jacfwd(along))(zero), differences, rtol=1e-5)
+    one = quick_jit(lambda e: jax.jvp(along, (zero,), (e,))[1])(np.ones(3))
+    np.testing.assert_allclose(one, np.sum(differences), rtol=1e-5)
+
+
+def test_under_jit_masks_may_be_closed_over_and_what_is_concrete_is_checked(tiny_prior, seen):
+    config = dataclasses.replace(CONFIG, steps=0)
+    loss = fit_jointly(tiny_prior, seen, config).loss
+    traced = jax.jit(lambda observations: fit_jointly(tiny_prior, observations, config).loss)
+    np.testing.assert_allclose(traced(seen), loss, rtol=1e-5)  # nothing to check
+
+    def with_real(real):
+        given = dataclasses.replace(seen, mask=np.asarray(seen.mask), real=real)
+        return jax.jit(lambda p: fit_jointly(tiny_prior, dataclasses.replace(given, points=p), config).loss)
+
+    for real in (seen.real, np.asarray(seen.real)):
+        np.testing.assert_allclose(with_real(real)(seen.points), loss, rtol=1e-5)
+    missing = np.array(seen.real)
+    missing[1, 0] = False
+    with pytest.raises(ValueError, match="without observation 0"):
+        with_real(missing)(seen.points)

@@ -1,4 +1,4 @@
-"""Observations of a scene's objects, closed: slips shrink, records stay consistent, what is no part of it stays."""
+"""Pose graphs of a scene's objects: slips shrink, records stay consistent, what is no part of it stays."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from pieces import apply, surface, without_symmetry
 from scipy.spatial.transform import Rotation
 
 import more2_jax.refinement.pose_graph_of_objects
-from more2_jax.config import ClosingConfig, preset
+from more2_jax.config import preset
 from more2_jax.network.embedding_batch import embed
 from more2_jax.network.prior import load_prior
 from more2_jax.refinement.pose_graph_of_objects import (
-    close_objects,
-    few,
-    gather,
-    most_turn_deg,
-    moved_by,
-    sides_seen,
+    max_turn_deg,
+    observation_surfaces,
+    optimized_observations,
+    oriented_batch,
+    refine_object_poses,
+    with_motions,
 )
 from more2_jax.tracking.objects import accumulated_points, new_object, points_of, seen_again
 from more2_jax.types import Instance, Observation, ScanRecord
@@ -64,7 +64,7 @@ def off(o, true):
 
 def test_slips_shrink_to_a_fiftieth_and_records_agree(prior):
     o, true = seen_with_slips(prior)
-    (new,) = close_objects(prior, [o], [0], records(3), {0: 0.0}, CONFIG)
+    (new,) = refine_object_poses(prior, [o], [0], records(3), {0: 0.0}, CONFIG)
     assert off(o, true) > 0.004
     assert off(new, true) < 0.02 * off(o, true)
     np.testing.assert_array_equal(new.observations[0].T_ref_scan, o.observations[0].T_ref_scan)
@@ -89,7 +89,7 @@ def test_any_orientation_far_from_zero(prior):
         pose = dataclasses.replace(seen, T_ref_scan=there @ seen.T_ref_scan)
         moved = seen_again(moved, Instance(id=1, points=points_of(o, seen)), pose)
     config = preset("robust")
-    (new,) = close_objects(prior, [moved], [0], records(3), {0: None}, config)
+    (new,) = refine_object_poses(prior, [moved], [0], records(3), {0: None}, config)
     found = dataclasses.replace(new, points=apply(back, new.points))
     assert off(found, true) < 0.02 * off(o, true)
 
@@ -98,30 +98,30 @@ def test_what_is_doubted_not_chosen_or_has_no_sides_stays(prior):
     o, _ = seen_with_slips(prior)
     doubted = dataclasses.replace(o.observations[1], accumulated=False)
     doubts = dataclasses.replace(o, observations=(o.observations[0], doubted, o.observations[2]))
-    one, other = close_objects(prior, [doubts, o], [0], records(3), {0: None}, CONFIG)
+    one, other = refine_object_poses(prior, [doubts, o], [0], records(3), {0: None}, CONFIG)
     assert other is o
     np.testing.assert_array_equal(one.observations[1].T_ref_scan, doubted.T_ref_scan)
     np.testing.assert_array_equal(one.points[one.point_scan == 1], o.points[o.point_scan == 1])
     assert not np.array_equal(one.observations[2].T_ref_scan, o.observations[2].T_ref_scan)
-    plain = dataclasses.replace(CONFIG, meshing=dataclasses.replace(CONFIG.meshing, seen_reach=0.0))
-    (same,) = close_objects(prior, [o], [0], records(3), {0: None}, plain)
+    plain = dataclasses.replace(CONFIG, meshing=dataclasses.replace(CONFIG.meshing, mls_bandwidth=0.0))
+    (same,) = refine_object_poses(prior, [o], [0], records(3), {0: None}, plain)
     np.testing.assert_allclose(same.points, o.points, atol=1e-6)
 
 
-def test_objects_of_different_numbers_of_scans_are_each_closed_as_alone(prior):
+def test_objects_of_different_numbers_of_scans_are_each_optimized_as_alone(prior):
     objects = [seen_with_slips(prior, count)[0] for count in (2, 3, 2)]
     scans = records(3)
-    together = close_objects(prior, objects, [0, 1, 2], scans, dict.fromkeys(range(3)), CONFIG)
+    together = refine_object_poses(prior, objects, [0, 1, 2], scans, dict.fromkeys(range(3)), CONFIG)
     for o, new in zip(objects, together, strict=True):
-        (alone,) = close_objects(prior, [o], [0], scans, {0: None}, CONFIG)
+        (alone,) = refine_object_poses(prior, [o], [0], scans, {0: None}, CONFIG)
         np.testing.assert_allclose(new.points, alone.points, atol=1e-5)
 
 
-def test_of_many_observations_the_first_and_the_last_are_closed(prior, monkeypatch):
-    monkeypatch.setattr(more2_jax.refinement.pose_graph_of_objects, "MOST_OBSERVATIONS", 3)
+def test_of_many_observations_the_first_and_the_last_are_optimized(prior, monkeypatch):
+    monkeypatch.setattr(more2_jax.refinement.pose_graph_of_objects, "MAX_OBSERVATIONS", 3)
     o, _ = seen_with_slips(prior, count=5)
-    assert few(o) == [0, 3, 4]
-    (new,) = close_objects(prior, [o], [0], records(5), {0: None}, CONFIG)
+    assert optimized_observations(o) == [0, 3, 4]
+    (new,) = refine_object_poses(prior, [o], [0], records(5), {0: None}, CONFIG)
     moved = [
         not np.array_equal(a.T_ref_scan, b.T_ref_scan)
         for a, b in zip(o.observations, new.observations, strict=True)
@@ -134,7 +134,7 @@ def test_what_would_turn_too_far_has_slipped_and_stays_as_registered(prior):
     moves = np.tile(np.eye(4), (3, 1, 1))
     for k, deg in ((0, 5.0), (1, 2.9), (2, 3.1)):
         moves[k, :3, :3] = Rotation.from_rotvec([0, 0, np.deg2rad(deg)]).as_matrix()
-    new = moved_by(o, moves, 3.0)
+    new = with_motions(o, moves, 3.0)
     for k in (0, 2):
         np.testing.assert_array_equal(new.observations[k].T_ref_scan, o.observations[k].T_ref_scan)
         np.testing.assert_allclose(new.points[o.point_scan == k], o.points[o.point_scan == k], atol=1e-12)
@@ -144,13 +144,12 @@ def test_what_would_turn_too_far_has_slipped_and_stays_as_registered(prior):
 
 def test_only_among_noise_may_what_turns_far_have_slipped(prior):
     o, _ = seen_with_slips(prior, count=2)
-    (exact, _) = sides = list(sides_seen(prior, o, records(2), None, CONFIG))
-    config = ClosingConfig(most_turn_deg=3.0)
-    assert all(s.exact for s in sides)
-    assert most_turn_deg([*sides, None], config) == np.inf
-    rough = dataclasses.replace(exact, exact=False)
-    assert most_turn_deg([exact, rough, exact], config) == np.inf  # most are
-    assert most_turn_deg([exact, rough], config) == most_turn_deg([None], config) == 3.0
+    (exact, _) = sides = list(observation_surfaces(prior, o, records(2), None, CONFIG))
+    assert all(s.noiseless for s in sides)
+    assert max_turn_deg([*sides, None]) == np.inf
+    rough = dataclasses.replace(exact, noiseless=False)
+    assert max_turn_deg([exact, rough, exact]) == np.inf  # most are
+    assert max_turn_deg([exact, rough]) == max_turn_deg([None]) == 3.0
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
@@ -159,12 +158,12 @@ def test_a_move_that_is_not_finite_is_none(prior, bad):
     moves = np.tile(np.eye(4), (2, 1, 1))
     moves[1, 0, 3] = bad
     np.testing.assert_array_equal(
-        moved_by(o, moves, 3.0).observations[1].T_ref_scan, o.observations[1].T_ref_scan
+        with_motions(o, moves, 3.0).observations[1].T_ref_scan, o.observations[1].T_ref_scan
     )
 
 
 @pytest.mark.parametrize("row", [[None, None], [None]])
 def test_observations_too_small_for_planes_are_gathered_as_nothing(row):
-    batch = gather([row], 2, ClosingConfig().points)
+    batch = oriented_batch([row], 2)
     assert not batch.mask.any()
-    assert float(batch.roughness[0]) == 0
+    assert float(batch.residual[0]) == 0

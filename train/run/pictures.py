@@ -19,7 +19,7 @@ from train.shards.shards import Shapes
 
 PIXELS = 128
 HALF = 0.62  # of the picture's width, canonical units
-MESHING = MeshingConfig(coarse=16, resolution=32)
+MESHING = MeshingConfig(coarse_resolution=16, resolution=32)
 ON_SURFACE = 12_000  # points drawn of a mesh
 LIGHT = np.array([0.35, -0.55, 0.76])
 # The picture's axes: to the right, up, and toward the eye, which looks down from the front left.
