@@ -34,7 +34,7 @@ def stop(module, name, nth):
     setattr(module, name, wrapped)
 
 place, nth = sys.argv[1], int(sys.argv[2])
-module = {"add_scan": more2_jax.scene, "reconstruct": more2_jax.scene, "mesh_of": more2_jax.meshing.object_mesh}
+module = {"add_scan": more2_jax.scene, "reconstruct": more2_jax.scene, "object_mesh": more2_jax.meshing.object_mesh}
 stop(module.get(place, more2_jax.storage.scene_folder), place, nth)
 sys.exit(main(sys.argv[3:]))
 """
@@ -79,7 +79,7 @@ def told(folder: Path) -> dict:
 @pytest.mark.parametrize(
     ("place", "nth", "sent", "kept"),
     [
-        pytest.param("mesh_of", 2, signal.SIGINT, 3, marks=pytest.mark.slow),  # between two meshes
+        pytest.param("object_mesh", 2, signal.SIGINT, 3, marks=pytest.mark.slow),  # between two meshes
         ("write_report", 2, signal.SIGKILL, 1),  # while the second scan is saved
         pytest.param("write_report", 2, signal.SIGINT, 1, marks=pytest.mark.slow),
         pytest.param(

@@ -17,7 +17,7 @@ CONFIG = dataclasses.replace(
     ROBUST,
     registration=dataclasses.replace(ROBUST.registration, yaw_starts=8, steps=3, icp_steps=8, keep_starts=2),
     joint=JointConfig(points=32, start="accumulated", steps=3),
-    meshing=dataclasses.replace(ROBUST.meshing, coarse=16, resolution=16),
+    meshing=dataclasses.replace(ROBUST.meshing, coarse_resolution=16, resolution=16),
 )
 
 
