@@ -163,3 +163,24 @@ def test_a_complaint_names_the_file(tmp_path):
 def test_settings_cannot_be_changed():
     with pytest.raises(dataclasses.FrozenInstanceError):
         preset("robust").min_points = 3
+
+
+# The settings of meshes and pose graphs as `robust` wrote them before they were renamed.
+OLD_ROBUST = """
+closing: {steps: 16, points: 1024, first_reach: 0.05, last_reach: 0.001, most_turn_deg: 3.0}
+meshing: {coarse: 16, resolution: 128, field_resolution: 32, level: observed, seen_reach: 0.02, screening: 0.12,
+  screening_of_many: 0.3, outlier_factor: 1.5, outlier_factor_of_many: 1.25, floor: true, half_width: 0.65}
+"""
+
+
+def test_settings_written_before_they_were_renamed_still_read(tmp_path):
+    path = tmp_path / "config.yaml"
+    path.write_text(OLD_ROBUST)
+    found, robust = load_config(path, SceneConfig), preset("robust")
+    assert found.meshing == robust.meshing and found.pose_graph == robust.pose_graph
+
+
+@pytest.mark.parametrize("values", [{"closing": {"most_turn_deg": 5.0}}, {"meshing": {"half_width": 0.7}}])
+def test_another_value_of_what_is_a_constant_now_is_refused(values):
+    with pytest.raises(ValueError, match=r"(most_turn_deg|half_width) is no setting any more; needed"):
+        from_dict(SceneConfig, values)

@@ -34,7 +34,7 @@ def stop(module, name, nth):
     setattr(module, name, wrapped)
 
 place, nth = sys.argv[1], int(sys.argv[2])
-module = {"add_scan": more2_jax.scene, "reconstruct": more2_jax.scene, "mesh_of": more2_jax.meshing.object_mesh}
+module = {"add_scan": more2_jax.scene, "reconstruct": more2_jax.scene, "object_mesh": more2_jax.meshing.object_mesh}
 stop(module.get(place, more2_jax.storage.scene_folder), place, nth)
 sys.exit(main(sys.argv[3:]))
 """
@@ -79,9 +79,9 @@ def told(folder: Path) -> dict:
 @pytest.mark.parametrize(
     ("place", "nth", "sent", "kept"),
     [
-        pytest.param("mesh_of", 2, signal.SIGINT, 3, marks=pytest.mark.slow),  # between two meshes
-        ("to_yaml", 2, signal.SIGKILL, 1),  # while the second scan is saved
-        pytest.param("to_yaml", 2, signal.SIGINT, 1, marks=pytest.mark.slow),
+        pytest.param("object_mesh", 2, signal.SIGINT, 3, marks=pytest.mark.slow),  # between two meshes
+        ("write_report", 2, signal.SIGKILL, 1),  # while the second scan is saved
+        pytest.param("write_report", 2, signal.SIGINT, 1, marks=pytest.mark.slow),
         pytest.param(
             "add_scan", 2, signal.SIGINT, 2, marks=pytest.mark.slow
         ),  # while the third scan is added
@@ -111,7 +111,7 @@ def test_a_stopped_run_goes_on_to_the_same_end(tmp_path, three, tiny, capsys, pl
 @POSIX
 def test_sigint_before_the_first_scan_is_done_leaves_nothing(tmp_path, three, tiny):
     argv = command(three, tmp_path / "room", tiny)
-    assert stopped(argv, "to_yaml", 1, signal.SIGINT) == (130, "interrupted\n")
+    assert stopped(argv, "write_report", 1, signal.SIGINT) == (130, "interrupted\n")
     assert not [p for p in tmp_path.iterdir() if "room" in p.name]
 
 

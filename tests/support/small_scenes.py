@@ -19,7 +19,7 @@ CONFIG = dataclasses.replace(
     matching=dataclasses.replace(ROBUST.matching, search=SEARCH),
     registration=dataclasses.replace(ROBUST.registration, search=SEARCH),
     joint=JointConfig(points=32, start="accumulated", steps=3),
-    meshing=dataclasses.replace(ROBUST.meshing, coarse=16, resolution=16),
+    meshing=dataclasses.replace(ROBUST.meshing, coarse_resolution=16, resolution=16),
 )
 
 
