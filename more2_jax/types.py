@@ -78,6 +78,17 @@ class PointCloud:
 
 
 @pytree
+class Sampled:
+    """A cloud as a farthest-point sample (`points`) and in full (`dense`): sparse points are compared with the
+    other's dense ones, so that a residual measures misfit and not the spacing of the samples."""
+
+    points: Float[Array, "*b n 3"] = quantity("position")
+    mask: Bool[Array, "*b n"] = quantity("invariant")
+    dense: Float[Array, "*b m 3"] = quantity("position")
+    dense_mask: Bool[Array, "*b m"] = quantity("invariant")
+
+
+@pytree
 class Anchors:
     """Points of the observed surface with the encoder's features there: what a local decoder looks up."""
 

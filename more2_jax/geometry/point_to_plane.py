@@ -18,8 +18,8 @@ from jaxtyping import Bool, Float, Int
 
 from more2_jax.config import MotionModel
 from more2_jax.geometry.nearest_grid import NearestGrid, look_up, nearest_grid
-from more2_jax.geometry.points import FAR, Sampled, nearest_index, thin, transformed
-from more2_jax.types import pytree, quantity
+from more2_jax.geometry.points import FAR, nearest_index, thin, transformed
+from more2_jax.types import Sampled, pytree, quantity
 
 ALONG = 0.02  # weight of sliding along the surface, against leaving it
 DAMPING = 1e-4  # of the normal equations, in shares of their trace: a ball may turn freely

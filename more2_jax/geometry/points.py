@@ -9,7 +9,7 @@ from jax import Array
 from jaxtyping import Bool, Float, Int
 
 from more2_jax.geometry.transform import transform
-from more2_jax.types import AnyArray, pytree, quantity
+from more2_jax.types import Sampled
 
 TINY = 1e-30
 FAR = 1e30  # squared distance to a row that is not there: larger than any, yet finite
@@ -41,17 +41,6 @@ def farthest_points(
     _, (index, more) = jax.lax.scan(body, start, length=count)
     real = jnp.concatenate([jnp.any(mask)[None], more[:-1]])
     return points[index], real
-
-
-@pytree
-class Sampled:
-    """A cloud as a farthest-point sample (`points`) and in full (`dense`): sparse points are compared with the
-    other's dense ones, so that a residual measures misfit and not the spacing of the samples."""
-
-    points: Float[AnyArray, "*b n 3"] = quantity("position")
-    mask: Bool[AnyArray, "*b n"] = quantity("invariant")
-    dense: Float[AnyArray, "*b m 3"] = quantity("position")
-    dense_mask: Bool[AnyArray, "*b m"] = quantity("invariant")
 
 
 def sample(points: Float[Array, "n 3"], mask: Bool[Array, " n"], count: int) -> Sampled:

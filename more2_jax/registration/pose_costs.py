@@ -12,9 +12,9 @@ from jaxtyping import Array, Bool, Float, Int
 from more2_jax.config import MotionModel, SurfaceSearch
 from more2_jax.geometry.free_space import looked_through
 from more2_jax.geometry.point_to_plane import Surface, correspondences
-from more2_jax.geometry.points import FAR, Sampled, transformed
+from more2_jax.geometry.points import FAR, transformed
 from more2_jax.network.prior import Prior, field_sdf, object_field
-from more2_jax.types import Embedding, Sight
+from more2_jax.types import Embedding, Sampled, Sight
 
 Inverse = Callable[[jaxlie.SE3], jaxlie.SE3]
 

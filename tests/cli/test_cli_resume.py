@@ -80,8 +80,8 @@ def told(folder: Path) -> dict:
     ("place", "nth", "sent", "kept"),
     [
         pytest.param("object_mesh", 2, signal.SIGINT, 3, marks=pytest.mark.slow),  # between two meshes
-        ("write_report", 2, signal.SIGKILL, 1),  # while the second scan is saved
-        pytest.param("write_report", 2, signal.SIGINT, 1, marks=pytest.mark.slow),
+        ("to_yaml", 2, signal.SIGKILL, 1),  # while the second scan is saved
+        pytest.param("to_yaml", 2, signal.SIGINT, 1, marks=pytest.mark.slow),
         pytest.param(
             "add_scan", 2, signal.SIGINT, 2, marks=pytest.mark.slow
         ),  # while the third scan is added
@@ -111,7 +111,7 @@ def test_a_stopped_run_goes_on_to_the_same_end(tmp_path, three, tiny, capsys, pl
 @POSIX
 def test_sigint_before_the_first_scan_is_done_leaves_nothing(tmp_path, three, tiny):
     argv = command(three, tmp_path / "room", tiny)
-    assert stopped(argv, "write_report", 1, signal.SIGINT) == (130, "interrupted\n")
+    assert stopped(argv, "to_yaml", 1, signal.SIGINT) == (130, "interrupted\n")
     assert not [p for p in tmp_path.iterdir() if "room" in p.name]
 
 

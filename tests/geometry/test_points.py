@@ -10,7 +10,6 @@ from scipy.spatial.transform import Rotation
 
 from more2_jax.geometry.points import (
     FAR,
-    Sampled,
     chamfer_distance,
     cloud_radius,
     dominant_eigenvector,
@@ -25,6 +24,7 @@ from more2_jax.geometry.points import (
     trimmed,
     two_way_rms,
 )
+from more2_jax.types import Sampled
 
 RNG = np.random.default_rng(0)
 CLOUD = RNG.normal(size=(50, 3)).astype(np.float32)

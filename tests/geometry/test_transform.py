@@ -18,7 +18,6 @@ import more2_jax
 from more2_jax.geometry.nearest_grid import NearestGrid
 from more2_jax.geometry.padding import pad_clouds
 from more2_jax.geometry.point_to_plane import Surface
-from more2_jax.geometry.points import Sampled
 from more2_jax.geometry.transform import rescale, transform
 from more2_jax.network.prior import encode
 from more2_jax.types import (
@@ -29,6 +28,7 @@ from more2_jax.types import (
     PointCloud,
     Quantity,
     Registration,
+    Sampled,
     Sight,
     pytree,
     quantity,

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import jaxlie
 import numpy as np
 import pytest
+from compiling import quick_jit
 from scipy.special import expit
 
 from more2_jax.config import EvidenceMatcher, SurfaceSearch, preset
@@ -125,15 +126,19 @@ def test_in_any_orientation_the_evidence_is_that_of_the_best_pose(tiny_prior):
         jax.tree.map(lambda x: jnp.asarray(x[0]), dataclasses.replace(side, origin=None))
         for side in (aligned.pairs.source, aligned.pairs.target)
     ]
-    sampled = [coarsened(whole_surface(x.cloud.points, x.cloud.mask), 128, 256, 8).sampled for x in sides]
+    sample = quick_jit(lambda p, m: coarsened(whole_surface(p, m), 128, 256, 8).sampled)
+    sampled = [sample(x.cloud.points, x.cloud.mask) for x in sides]
     codes = [x.code for x in sides]
     T = jax.tree.map(lambda x: x[0], aligned.found.poses)
-    off = off_fields(tiny_prior, T, tuple(sampled), tuple(codes))
+    off = quick_jit(off_fields)(tiny_prior, T, tuple(sampled), tuple(codes))
     np.testing.assert_allclose([found.off_source[0], found.off_target[0]], off[0], atol=1e-3)
     cost = jnp.asarray(aligned.found.cost[0])
     cost += field_cost(cost, off.mean(axis=1), search.field_weight)
     assert float(cost[0]) <= float(cost.min()) + 1e-2
-    own = [off_field(tiny_prior, jaxlie.SE3.identity(), c, e) for c, e in zip(sampled, codes, strict=True)]
+    own = [
+        quick_jit(off_field)(tiny_prior, jaxlie.SE3.identity(), c, e)
+        for c, e in zip(sampled, codes, strict=True)
+    ]
     np.testing.assert_allclose(found.off_own[0], max(own), atol=1e-3)
 
 

@@ -10,49 +10,49 @@ import numpy as np
 import pieces
 import pytest
 import trimesh
-from compiling import quick_jit
 from scipy.spatial.transform import Rotation
 
-from more2_jax.config import RegistrationConfig, preset
-from more2_jax.geometry.padding import pad_batch, pad_clouds
-from more2_jax.geometry.points import sample
-from more2_jax.geometry.poses import world_pose
-from more2_jax.network.embedding_batch import SMALLEST_BATCH, at_zero, padded, stack, unstack
-from more2_jax.network.prior import encode, encode_one, load_prior, sdf, shipped_priors
+from more2_jax.config import DescentRegistration, SurfaceRegistration, SurfaceSearch
+from more2_jax.geometry.padding import pad_clouds
+from more2_jax.geometry.points import cloud_radius
+from more2_jax.geometry.transform import rescale
+from more2_jax.network.embedding_batch import embed
+from more2_jax.network.prior import encode, load_prior, sdf, shipped_priors
 from more2_jax.registration import register as registration
-from more2_jax.registration.register import register, register_one
-from more2_jax.registration.starting_poses import Pair
-from more2_jax.registration.surface import APART_DEG, lowest_apart
+from more2_jax.registration.descent import registration_loss, sampled
+from more2_jax.registration.pair_batch import batch_of, local_batch, pair_up
+from more2_jax.registration.pose_costs import APART_DEG, lowest_apart
+from more2_jax.registration.register import register
+from more2_jax.registration.search import scaled_pose
+from more2_jax.types import ObservedObject
 
-BATCH, POINTS = 16, 512  # of every robust registration here: compiled once a prior
+POINTS = 512  # of every cloud registered by surfaces here: compiled once a prior
 # Fewer points than the preset: the clouds are clean, and what is tested is the same.
-FEWER = {"points": 64, "coarse_points": 64, "coarse_dense": 256, "cells": 16, "keep_starts": 4}
-FREE, UPRIGHT = (
-    dataclasses.replace(preset("robust", upright=up).registration, **FEWER) for up in (False, True)
-)
-PAPER = RegistrationConfig(points=64, sdf_points=64, steps=5, icp_steps=3)
+SURFACE = SurfaceRegistration(search=SurfaceSearch(points=64, dense=256, cells=16, keep=4))
+PAPER = DescentRegistration(points=64, sdf_points=64, steps=5, icp_steps=3)
 # Random weights any way up, shipped weights upright.
 CASES = [
-    ("tiny", False),
-    *[pytest.param(name, True, marks=[pytest.mark.slow] * (name != "small")) for name in shipped_priors()],
+    ("tiny", "free"),
+    *[
+        pytest.param(name, "upright", marks=[pytest.mark.slow] * (name != "small"))
+        for name in shipped_priors()
+    ],
 ]
 
 
 def clouds_of(clouds):
-    return pad_batch(pad_clouds(clouds, POINTS), BATCH)
+    return pad_clouds(clouds, POINTS)
 
 
-def register_clouds(prior, source, target, *, upright=False):
+def pairs_of(prior, source, target):
+    return pair_up(*(batch_of(c, encode(prior, c)) for c in (source, target)))
+
+
+def register_clouds(prior, source, target, motion="free"):
     """Poses between the frames of padded clouds, 4×4 each, and the records of the registrations."""
-    config = UPRIGHT if upright else FREE
-    result = register(prior, source, target, encode(prior, source), encode(prior, target), config, upright)
-    return world_poses(result, source, target), result
-
-
-def world_poses(result, source, target):
-    host = jax.device_get(result.T_target_source)
-    rows = [jax.tree.map(lambda x, k=k: x[k], host) for k in range(len(source.points))]
-    return [world_pose(T, target.origin[k], source.origin[k]) for k, T in enumerate(rows)]
+    pairs = pairs_of(prior, source, target)
+    result = register(prior, pairs, SURFACE, motion)
+    return pairs.to_world(result.T_target_source), result
 
 
 def moved(clouds, poses, seed=0):
@@ -66,7 +66,7 @@ def furniture():
 
 
 def assert_recovered(found, poses, clouds):
-    for got, T, cloud in zip(found, poses, clouds, strict=False):
+    for got, T, cloud in zip(found, poses, clouds, strict=True):
         degrees, meters = pieces.pose_error(got, T, cloud)
         assert degrees < 0.5 and meters < 0.005 * pieces.size(cloud)
 
@@ -74,18 +74,18 @@ def assert_recovered(found, poses, clouds):
 # --- the law ----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("name", "upright"), CASES)
-def test_registering_x_to_tx_recovers_t_and_the_way_back_its_inverse(tiny_prior, name, upright):
+@pytest.mark.parametrize(("name", "motion"), CASES)
+def test_registering_x_to_tx_recovers_t_and_the_way_back_its_inverse(tiny_prior, name, motion):
     prior, clouds = tiny_prior if name == "tiny" else load_prior(name), furniture()
     rng = np.random.default_rng(1)
-    poses = [pieces.random_pose(rng, upright=upright) for _ in clouds]
+    poses = [pieces.random_pose(rng, upright=motion == "upright") for _ in clouds]
     source, target = clouds_of(clouds), clouds_of(moved(clouds, poses))
-    there, record = register_clouds(prior, source, target, upright=upright)
-    back, _ = register_clouds(prior, target, source, upright=upright)
+    there, record = register_clouds(prior, source, target, motion)
+    back, _ = register_clouds(prior, target, source, motion)
     assert len(clouds) >= 8
     assert_recovered(there, poses, clouds)
     assert bool(record.converged.all())
-    for T_ab, T_ba, cloud in zip(there, back, clouds, strict=False):
+    for T_ab, T_ba, cloud in zip(there, back, clouds, strict=True):
         degrees, meters = pieces.pose_error(T_ab @ T_ba, np.eye(4), cloud)
         assert degrees < 0.5 and meters < 0.005 * pieces.size(cloud)
 
@@ -113,7 +113,7 @@ def test_kilometers_from_zero_cost_no_precision(tiny_prior):
     surveyed = [away @ T @ np.linalg.inv(away) for T in poses]
     source = [x + far for x in clouds]
     found, _ = register_clouds(tiny_prior, clouds_of(source), clouds_of(moved(source, surveyed)))
-    for got, T, cloud in zip(found, surveyed, source, strict=False):
+    for got, T, cloud in zip(found, surveyed, source, strict=True):
         gap = np.linalg.norm(pieces.apply(got, cloud) - pieces.apply(T, cloud), axis=1)
         assert gap.max() < 1e-4 * pieces.size(cloud)
 
@@ -145,7 +145,7 @@ def test_flat_straight_and_single_points_give_finite_poses(tiny_prior):
     poses = [pieces.random_pose(np.random.default_rng(k), upright=False) for k in range(4)]
     found, record = register_clouds(tiny_prior, clouds_of(degenerate), clouds_of(moved(degenerate, poses)))
     assert np.isfinite(found).all() and bool(jnp.isfinite(record.rms_m).all())
-    for got, T, x in zip(found, poses, degenerate, strict=False):
+    for got, T, x in zip(found, poses, degenerate, strict=True):
         gap = np.linalg.norm(pieces.apply(got, x).mean(axis=0) - pieces.apply(T, x).mean(axis=0))
         assert gap < 0.005 * max(pieces.size(x), 1e-3)
 
@@ -155,78 +155,86 @@ def test_flat_straight_and_single_points_give_finite_poses(tiny_prior):
 
 @pytest.fixture(scope="module")
 def still(tiny_prior):
-    """Seven pieces twice, other points each time, and their codes; padded as scenes are."""
+    """Seven pieces twice, other points each time; padded as scenes are."""
     clouds = furniture()[:7]
-    source, target = (padded(c) for c in (clouds, moved(clouds, [np.eye(4)] * 7, seed=5)))
-    return source, target, encode(tiny_prior, source), encode(tiny_prior, target)
+    sides = [observed(tiny_prior, c) for c in (clouds, moved(clouds, [np.eye(4)] * 7, seed=5))]
+    return pair_up(*map(local_batch, sides))
 
 
-def first(count, batch):
-    return jax.tree.map(lambda x: x[:count], batch)
+def observed(prior, clouds):
+    return [ObservedObject(points=p, embedding=e) for p, e in zip(clouds, embed(prior, clouds), strict=True)]
 
 
 def test_the_loss_returned_is_that_of_the_pose_returned(tiny_prior, still):
-    result = register(tiny_prior, *still, PAPER)
+    result = register(tiny_prior, still, PAPER)
 
     @jax.jit
-    @partial(jax.vmap, in_axes=(None, 0, 0, 0))
-    def loss_of(prior, clouds, codes, T):
-        (source, target), (source_mask, target_mask) = clouds
-        pair = pair_of(source, target, source_mask, target_mask, codes)
-        radius = registration.cloud_radius(pair.target.points, pair.target.mask)
-        loss = registration.registration_loss(prior, registration.rescale(pair, 1 / radius), PAPER)
-        return loss(jaxlie.SE3.from_rotation_and_translation(T.rotation(), T.translation() / radius))
+    @partial(jax.vmap, in_axes=(None, 0, 0))
+    def loss_of(prior, pair, T):
+        pair = sampled(pair, PAPER)
+        radius = cloud_radius(pair.target.points, pair.target.mask)
+        return registration_loss(prior, rescale(pair, 1 / radius), PAPER)(scaled_pose(T, 1 / radius))
 
-    clouds = [[getattr(c, name) for c in still[:2]] for name in ("points", "mask")]
-    # The very codes: encoded one at a time they differ in their last digits, and so does the field.
-    expected = loss_of(tiny_prior, clouds, [at_zero(code) for code in still[2:]], result.T_target_source)
+    expected = loss_of(tiny_prior, still.local(), result.T_target_source)
     np.testing.assert_allclose(result.loss, expected, rtol=1e-4)
 
 
-def pair_of(source, target, source_mask, target_mask, codes, points=PAPER.points):
-    return Pair(
-        source=sample(source, source_mask, points, dense=False),
-        target=sample(target, target_mask, points, dense=False),
-        source_code=codes[0],
-        target_code=codes[1],
-        offset=jnp.zeros(3, source.dtype),
+def test_of_several_candidates_the_one_that_ends_with_the_lowest_residual_is_returned(tiny_prior, still):
+    pair = jax.tree.map(lambda x: x[:1], still.local())
+    turns = jax.vmap(jaxlie.SO3.from_z_radians)(jnp.deg2rad(jnp.array([180.0, 2.0, 90.0])))
+    starts = jaxlie.SE3.from_rotation_and_translation(turns, jnp.zeros((3, 3)))
+    alone = [
+        register(
+            tiny_prior,
+            dataclasses.replace(pair, candidates=jaxlie.SE3(starts.wxyz_xyz[None, k : k + 1])),
+            PAPER,
+        )
+        for k in range(3)
+    ]
+    together = register(
+        tiny_prior, dataclasses.replace(pair, candidates=jaxlie.SE3(starts.wxyz_xyz[None])), PAPER
     )
+    best = int(np.argmin([float(r.rms_m[0]) for r in alone]))
+    assert best == 1
+    for name in ("loss", "rms_m"):
+        np.testing.assert_allclose(getattr(together, name), getattr(alone[best], name), rtol=1e-3)
+    T, own = together.T_target_source, alone[best].T_target_source
+    np.testing.assert_allclose(T.as_matrix(), own.as_matrix(), atol=1e-3)
 
 
 def test_batches_of_different_size_are_refused(tiny_prior, still):
-    (two, _, a, _), (three, _, b, _) = first(2, still), first(3, still)
-    with pytest.raises(ValueError, match=r"\[2, 3, 2, 3\].*needed equal numbers"):
-        register(tiny_prior, two, three, a, b, PAPER)
+    two, three = still.source.take([0, 1]), still.target.take([0, 1, 2])
+    with pytest.raises(ValueError, match=r"\[2, 2, 3, 3\].*needed equal numbers"):
+        pair_up(two, three)
 
 
-@pytest.mark.parametrize("config", [FREE, PAPER], ids=["robust", "paper"])
-def test_records_of_another_encoder_are_refused_where_the_decoder_would_be_asked(tiny_prior, config):
-    source, target = clouds_of(furniture()[:1]), clouds_of(furniture()[:1])
-    other = encode(tiny_prior, target)  # without anchors, which `small` looks up
+@pytest.mark.parametrize("method", [SURFACE, PAPER], ids=["surface", "descent"])
+def test_records_of_another_encoder_are_refused_where_the_decoder_would_be_asked(tiny_prior, method):
+    cloud = clouds_of(furniture()[:1])
+    other = encode(tiny_prior, cloud)  # without anchors, which `small` looks up
+    pairs = pair_up(batch_of(cloud, other), batch_of(cloud, other))
     with pytest.raises(ValueError, match=r"register got embeddings with 0 levels of anchors.*needed 2"):
-        register(load_prior("small"), source, target, other, other, config)
+        register(load_prior("small"), pairs, method)
     with pytest.raises(ValueError, match=r"sdf got embeddings with 0 levels of anchors.*needed 2"):
-        sdf(load_prior("small"), other, np.zeros((BATCH, 1, 3)))
+        sdf(load_prior("small"), other, np.zeros((1, 1, 3)))
 
 
 def test_records_of_another_encoder_are_registered_where_the_prior_is_not_asked(tiny_prior):
     clouds, rng = furniture(), np.random.default_rng(1)
     poses = [pieces.random_pose(rng, upright=True) for _ in clouds]
-    source, target = clouds_of(clouds), clouds_of(moved(clouds, poses))
-    codes = [encode(tiny_prior, c) for c in (source, target)]  # without anchors, which `small` looks up
-    unasked = dataclasses.replace(UPRIGHT, field_weight=0.0)
-    result = register(load_prior("small"), source, target, *codes, unasked, True)
-    assert_recovered(world_poses(result, source, target), poses, clouds)
+    # The codes have no anchors, which `small` looks up.
+    pairs = pairs_of(tiny_prior, clouds_of(clouds), clouds_of(moved(clouds, poses)))
+    unasked = dataclasses.replace(SURFACE, search=dataclasses.replace(SURFACE.search, field_weight=0.0))
+    result = register(load_prior("small"), pairs, unasked, "upright")
+    assert_recovered(pairs.to_world(result.T_target_source), poses, clouds)
 
 
-def test_scenes_of_like_size_share_one_program(tiny_prior, still):
+def test_scenes_of_like_size_share_one_program(tiny_prior):
     programs = []
     for count in (5, 7):
-        cloud = padded(furniture()[:count])
-        code, _ = stack(unstack(still[2], count))
-        register(tiny_prior, cloud, cloud, code, code, PAPER)
-        assert len(cloud.points) == SMALLEST_BATCH
-        programs.append(registration._register_many._cache_size())
+        batch = local_batch(observed(tiny_prior, furniture()[:count]))
+        register(tiny_prior, pair_up(batch, batch), PAPER)
+        programs.append(registration._by_descent._cache_size())
     assert programs[0] >= 1 and programs[0] == programs[1]
 
 
@@ -241,39 +249,3 @@ def test_the_poses_kept_are_the_best_that_lie_apart():
                 kept.append(k)
         group = jaxlie.SO3(jnp.asarray(rotations.as_quat(scalar_first=True), jnp.float32))
         np.testing.assert_array_equal(lowest_apart(jnp.asarray(cost), group, 5), kept[:5])
-
-
-# --- gradients --------------------------------------------------------------------------------------------------
-
-
-def test_gradient_through_encoder_kabsch_and_refinement_agrees_with_finite_differences(tiny_prior):
-    config = RegistrationConfig(points=32, sdf_points=32, steps=5, icp_steps=2)
-    rng = np.random.default_rng(0)
-    cloud = pieces.surface(pieces.without_symmetry()[4], 64) - [0, 0, 0.4]
-    turned = pieces.apply(pieces.random_pose(rng, upright=False, reach=0.1), cloud)
-    with jax.enable_x64(True):
-        params = jax.tree.map(lambda x: jnp.asarray(x, jnp.float64), tiny_prior.params)
-
-        @quick_jit
-        @jax.value_and_grad
-        def final_loss(source, target, every, prior):
-            # Both in one go: half as much to compile.
-            codes = jax.vmap(partial(encode_one, prior))(
-                jnp.stack([source, target]), jnp.stack([every, every])
-            )
-            codes = [jax.tree.map(lambda x, k=k: x[k], codes) for k in (0, 1)]
-            pair = pair_of(source, target, every, every, codes, config.points)
-            return register_one(prior, pair, config, False).loss
-
-        def at(source):
-            prior = dataclasses.replace(tiny_prior, params=params)
-            return final_loss(jnp.asarray(source), jnp.asarray(turned), np.ones(64, bool), prior)
-
-        source = cloud + 0.01 * rng.normal(size=cloud.shape)
-        gradient = at(source)[1]
-        assert gradient.dtype == jnp.float64 and bool(jnp.isfinite(gradient).all())
-        assert float(jnp.abs(gradient).max()) > 1e-4
-        for _ in range(4):
-            way, eps = rng.normal(size=cloud.shape), 1e-6
-            slope = (at(source + eps * way)[0] - at(source - eps * way)[0]) / (2 * eps)
-            assert float(jnp.vdot(gradient, way)) == pytest.approx(float(slope), rel=1e-3)

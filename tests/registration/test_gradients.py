@@ -1,0 +1,122 @@
+"""Gradients through registration: finite differences confirm them, and both modes agree; masks may be closed over."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+import pieces
+import pytest
+from compiling import quick_jit
+
+from more2_jax.config import DescentRegistration, SurfaceRegistration, SurfaceSearch
+from more2_jax.network.prior import encode
+from more2_jax.registration.pair_batch import batch_of, pair_up
+from more2_jax.registration.register import register
+from more2_jax.types import PointCloud
+
+COUNT = 64
+MASK = np.ones((1, COUNT), bool)  # closed over by what is compiled
+DESCENT = DescentRegistration(points=32, sdf_points=32, steps=5, icp_steps=2)
+SURFACE = SurfaceRegistration(
+    search=SurfaceSearch(points=32, dense=64, cells=8, keep=2, steps=4),
+    points=32,
+    steps=3,
+    field_points=32,
+    polish_points=32,
+    polish_steps=2,
+)
+
+
+def start(degrees):
+    """One candidate of one pair."""
+    turn = jaxlie.SO3.from_z_radians(jnp.deg2rad(jnp.array(degrees)))
+    return jaxlie.SE3(jaxlie.SE3.from_rotation(turn).wxyz_xyz[None, None])
+
+
+def loss_with(method, candidates=None):
+    """What registration ends with, as a function of both clouds (n, 3) and the prior; codes follow or are given."""
+
+    def loss(source, target, prior, codes=None):
+        clouds = [PointCloud(points=x[None], mask=MASK) for x in (source, target)]
+        codes = codes or [encode(prior, c) for c in clouds]
+        pairs = pair_up(*map(batch_of, clouds, codes), candidates=candidates)
+        return register(prior, pairs, method).loss[0]
+
+    return loss
+
+
+def codes_of(prior, *clouds):
+    return [encode(prior, PointCloud(points=jnp.asarray(x)[None], mask=MASK)) for x in clouds]
+
+
+@pytest.fixture(scope="module")
+def clouds():
+    rng = np.random.default_rng(0)
+    cloud = pieces.surface(pieces.without_symmetry()[4], COUNT) - [0, 0, 0.4]
+    turned = pieces.apply(pieces.random_pose(rng, upright=False, reach=0.1), cloud)
+    return cloud + 0.01 * rng.normal(size=cloud.shape), turned
+
+
+def test_gradient_through_encoder_kabsch_and_refinement_agrees_with_finite_differences(tiny_prior, clouds):
+    """In float64; with the codes given also forward, which the encoder is not made for."""
+    rng = np.random.default_rng(0)
+    with jax.enable_x64(True):
+        params = jax.tree.map(lambda x: jnp.asarray(x, jnp.float64), tiny_prior.params)
+        prior = dataclasses.replace(tiny_prior, params=params)
+        source, target = (jnp.asarray(x) for x in clouds)
+        codes, loss = codes_of(prior, source, target), loss_with(DESCENT)
+
+        def slopes(x, way, given):
+            """By reverse and by forward mode."""
+            gradient = jax.grad(lambda x: loss(x, target, prior, given))(x)
+            if given is None:
+                return gradient, jnp.vdot(gradient, way)
+            return gradient, jax.jvp(lambda x: loss(x, target, prior, given), (x,), (way,))[1]
+
+        for given in (None, codes):
+            at = quick_jit(lambda x, given=given: loss(x, target, prior, given))
+            slopes_of = quick_jit(lambda x, way, given=given: slopes(x, way, given))
+            for _ in range(4):
+                way, eps = jnp.asarray(rng.normal(size=source.shape)), 1e-6
+                slope = (at(source + eps * way) - at(source - eps * way)) / (2 * eps)
+                gradient, forward = slopes_of(source, way)
+                assert gradient.dtype == jnp.float64 and bool(jnp.isfinite(gradient).all())
+                assert float(jnp.abs(gradient).max()) > 1e-4
+                along = float(jnp.vdot(gradient, way))
+                assert along == pytest.approx(float(slope), rel=1e-3)
+                assert float(forward) == pytest.approx(along, rel=1e-6)
+
+
+@pytest.mark.parametrize("moved", [0, 1], ids=["source", "target"])
+@pytest.mark.parametrize(
+    ("method", "candidates"),
+    [(DESCENT, start(10.0)), (SURFACE, start(10.0)), (SURFACE, None)],
+    ids=["descent", "surface", "surface without candidates"],
+)
+def test_both_modes_agree_whichever_cloud_is_traced(tiny_prior, clouds, method, candidates, moved):
+    """The other cloud and both codes are constants of the program."""
+    both = [jnp.asarray(x, jnp.float32) for x in clouds]
+    codes, loss = codes_of(tiny_prior, *both), loss_with(method, candidates)
+    way = jnp.asarray(np.random.default_rng(1).normal(size=both[0].shape), jnp.float32)
+
+    def of_one(x):
+        given = [x, both[1]] if moved == 0 else [both[0], x]
+        return loss(*given, tiny_prior, codes)
+
+    @quick_jit
+    def slopes(x, way):
+        value, forward = jax.jvp(of_one, (x,), (way,))
+        return value, forward, jax.grad(of_one)(x)
+
+    value, forward, gradient = slopes(both[moved], way)
+    assert bool(jnp.isfinite(gradient).all()) and float(jnp.abs(gradient).max()) > 1e-4
+    assert float(forward) == pytest.approx(float(jnp.vdot(gradient, way)), rel=2e-3)
+    assert float(value) == pytest.approx(float(of_one(both[moved])), rel=1e-3)
+
+
+def test_gradients_through_the_encoder_reach_surface_registration(tiny_prior, clouds):
+    source, target = (jnp.asarray(x, jnp.float32) for x in clouds)
+    gradient = quick_jit(jax.grad(loss_with(SURFACE, start(10.0))))(source, target, tiny_prior)
+    assert bool(jnp.isfinite(gradient).all()) and float(jnp.abs(gradient).max()) > 1e-4
