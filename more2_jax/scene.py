@@ -110,10 +110,10 @@ def reconstruct(
     timing, objects = dict(scene.timing_s), list(scene.objects)
     todo = [k for k, o in enumerate(objects) if o.mesh is None]
     again = [k for k in todo if in_several_scans(objects[k])]
-    close, fit = again if config.pose_graph.steps else [], again if config.joint.steps else []
-    with staged(timing, progress, "close", len(close)):
-        floors = {k: object_floor(objects[k], scene.scans, config) for k in close}
-        objects = refine_object_poses(prior, objects, close, scene.scans, floors, config)
+    align, fit = again if config.pose_graph.steps else [], again if config.joint.steps else []
+    with staged(timing, progress, "close", len(align)):
+        floors = {k: object_floor(objects[k], scene.scans, config) for k in align}
+        objects = refine_object_poses(prior, objects, align, scene.scans, floors, config)
     with staged(timing, progress, "joint", len(fit)):
         objects = fit_objects(prior, objects, fit, config)
     with staged(timing, progress, "mesh", len(todo)) as advance:

@@ -15,13 +15,13 @@ from more2_jax.report.blob import Blob
 from more2_jax.report.coverage import coverage
 from more2_jax.report.palette import color, ink
 from more2_jax.report.thinning import (
-    MOST_COARSE_FACES,
-    MOST_FACES,
-    MOST_POINTS,
+    MAX_COARSE_FACES,
+    MAX_FACES,
+    MAX_POINTS,
+    cluster_vertices,
     coarse_faces,
-    share_of,
-    simplified,
-    thinned,
+    kept_share,
+    random_subsample,
 )
 from more2_jax.report.wording import Verdict, changes_from, doubts_of, headline, phrase, verdict
 from more2_jax.tracking.objects import place_of
@@ -58,9 +58,9 @@ def payload(scene: LivingScene, config: SceneConfig) -> tuple[dict[str, Any], st
     everything = np.concatenate([objects, *(_background(s) for s in scene.scans)])
     low, high = everything.min(axis=0), everything.max(axis=0)
     middle = (low + high) / 2
-    points = share_of(len(everything), MOST_POINTS)
-    faces = share_of(sum(len(o.mesh.faces) for o in scene.objects if o.mesh is not None), MOST_FACES)
-    coarse = MOST_COARSE_FACES // len(scene.objects)
+    points = kept_share(len(everything), MAX_POINTS)
+    faces = kept_share(sum(len(o.mesh.faces) for o in scene.objects if o.mesh is not None), MAX_FACES)
+    coarse = MAX_COARSE_FACES // len(scene.objects)
     return {
         "scans": [_scan(s, blob, points, middle) for s in scene.scans],
         "objects": [_object(o, k, blob, points, faces, coarse, middle) for k, o in enumerate(scene.objects)],
@@ -92,7 +92,7 @@ def _pair(scene: LivingScene, verdicts: list[Verdict], a: int, b: int) -> dict[s
 
 def _scan(s: ScanRecord, blob: Blob, share: float, middle: Point) -> dict[str, Any]:
     has = len(s.background) > 0
-    background = blob.add_points(thinned(_background(s) - middle, share)) if has else None
+    background = blob.add_points(random_subsample(_background(s) - middle, share)) if has else None
     return {"name": s.name, "background": background}
 
 
@@ -106,8 +106,8 @@ def _object(
 ) -> dict[str, Any]:
     """One object; its cloud and mesh relative to `anchor`, the mean of its points in the reference frame."""
     anchor = o.points.mean(axis=0)
-    parts = [thinned(o.points[o.point_scan == seen.scan], points) for seen in o.observations]
-    mesh = None if o.mesh is None else simplified(o.mesh, faces)
+    parts = [random_subsample(o.points[o.point_scan == seen.scan], points) for seen in o.observations]
+    mesh = None if o.mesh is None else cluster_vertices(o.mesh, faces)
     return {
         "id": o.id,
         "number": number,

@@ -1,4 +1,4 @@
-"""Clouds and meshes made small enough for a page."""
+"""Point clouds subsampled and meshes simplified by vertex clustering, small enough for a page."""
 
 from __future__ import annotations
 
@@ -8,23 +8,25 @@ from jaxtyping import Float, Int
 
 from more2_jax.types import Mesh
 
-MOST_POINTS = 500_000  # of a page
-MOST_FACES = 150_000  # of a page
-MOST_COARSE_FACES = 10_000  # of a page, while things move
+MAX_POINTS = 500_000  # of a page
+MAX_FACES = 150_000  # of a page
+MAX_COARSE_FACES = 10_000  # of a page, while things move
 
 
-def share_of(total: int, most: int) -> float:
+def kept_share(total: int, most: int) -> float:
     """The share to keep of each part so that all parts together keep to `most`."""
     return min(1.0, most / max(total, 1))
 
 
-def thinned(points: Float[np.ndarray, "n 3"], share: float, seed: int = 0) -> Float[np.ndarray, "m 3"]:
+def random_subsample(
+    points: Float[np.ndarray, "n 3"], share: float, seed: int = 0
+) -> Float[np.ndarray, "m 3"]:
     """A share of the points in random order, at least one: any first part of it is an even sample too."""
     keep = min(len(points), max(1, round(share * len(points))))
     return points[np.random.default_rng(seed).permutation(len(points))[:keep]]
 
 
-def simplified(mesh: Mesh, share: float) -> Mesh:
+def cluster_vertices(mesh: Mesh, share: float) -> Mesh:
     """The mesh with about a `share` of its faces: vertices in one cell of a grid become one, at their mean."""
     if share >= 1:
         return mesh

@@ -23,7 +23,7 @@ from eval.calibration import (
 )
 from more2_jax.config import preset
 from more2_jax.matching.calibration import FREE, UNASKED, UPRIGHT, Calibration
-from more2_jax.matching.candidates import fit_pairs
+from more2_jax.matching.candidates import align_candidates, odds_of
 from more2_jax.network.embedding_batch import embed
 from more2_jax.types import ObservedObject
 
@@ -103,8 +103,9 @@ def test_thinned_rooms_are_parts_of_the_rooms_and_not_all_the_same():
 def test_pairs_are_weighed_as_the_package_weighs_them(tiny_prior):
     scene = known_scene(copies=("a", "b", "c"), scans=3)
     config = preset("robust", upright=True)
-    fewer = dataclasses.replace(config.registration, coarse_steps=2, coarse_dense=256, cells=8, yaw_starts=4)
-    config = dataclasses.replace(config, registration=fewer)
+    search = dataclasses.replace(config.matching.search, steps=2, dense=256, cells=8, turns=4)
+    matcher = dataclasses.replace(config.matching, search=search)
+    config = dataclasses.replace(config, matching=matcher)
     found = scan_pairs("room", scene, tiny_prior, config)
     assert len(found) == 2
     sides = [
@@ -113,7 +114,8 @@ def test_pairs_are_weighed_as_the_package_weighs_them(tiny_prior):
         for codes in [embed(tiny_prior, [i.points for i in scan.instances])]
     ]
     for b, pair in enumerate(found, 1):
-        odds = fit_pairs(tiny_prior, sides[0], sides[b], config).odds
+        aligned = align_candidates(tiny_prior, sides[0], sides[b], matcher, "upright")
+        odds = odds_of(aligned, search, "upright")
         np.testing.assert_allclose(pair.odds(UPRIGHT), odds, rtol=1e-3, atol=1e-3)
 
 

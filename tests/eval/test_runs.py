@@ -20,9 +20,10 @@ from eval.harness.results import finish
 from eval.harness.runs import run_scenes, start_run
 from eval.matching import match_own
 from eval.scores.figures import Figure
-from more2_jax.config import RegistrationConfig, SceneConfig, preset
+from more2_jax.config import DescentRegistration, SceneConfig, preset
 from more2_jax.network.embedding_batch import embed
 from more2_jax.network.prior import save_prior
+from more2_jax.types import ObservedObject
 
 
 @pytest.fixture
@@ -100,13 +101,11 @@ def test_fixed_batches_give_what_single_calls_give(tiny_prior):
     for a, b in zip(codes, alone, strict=True):
         np.testing.assert_allclose(a.inv, b.inv, atol=1e-5)
         np.testing.assert_allclose(a.origin, b.origin)
-    config = RegistrationConfig(points=64, sdf_points=16, steps=2, icp_steps=3)
-    pairs = [
-        PairToRegister(source=clouds[4 + k], target=clouds[k], source_code=codes[4 + k], target_code=codes[k])
-        for k in range(4)
-    ]
-    together = register_all(tiny_prior, pairs, config, False, 3)
-    alone = [register_all(tiny_prior, [p], config, False, 3)[0] for p in pairs]
+    method = DescentRegistration(points=64, sdf_points=16, steps=2, icp_steps=3)
+    seen = [ObservedObject(points=c, embedding=e) for c, e in zip(clouds, codes, strict=True)]
+    pairs = [PairToRegister(source=seen[4 + k], target=seen[k]) for k in range(4)]
+    together = register_all(tiny_prior, pairs, method, "free", 3)
+    alone = [register_all(tiny_prior, [p], method, "free", 3)[0] for p in pairs]
     np.testing.assert_allclose(together, alone, atol=1e-4)
 
 

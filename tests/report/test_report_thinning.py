@@ -5,13 +5,13 @@ import pytest
 import trimesh
 from factories import cube
 
-from more2_jax.report.thinning import coarse_faces, simplified, thinned
+from more2_jax.report.thinning import cluster_vertices, coarse_faces, random_subsample
 from more2_jax.types import Mesh
 
 
 def test_thinning_keeps_an_even_sample():
     cloud = np.random.default_rng(0).uniform(size=(10_000, 3))
-    few = thinned(cloud, 0.1)
+    few = random_subsample(cloud, 0.1)
     assert len(few) == 1000
     assert {tuple(p) for p in few} <= {tuple(p) for p in cloud}
     assert np.abs(few[:100].mean(axis=0) - 0.5).max() < 0.1  # the first part of it is a sample too
@@ -19,11 +19,11 @@ def test_thinning_keeps_an_even_sample():
 
 def test_simplified_mesh_is_near_the_whole():
     ball = trimesh.creation.icosphere(5)
-    small = simplified(Mesh(vertices=ball.vertices, faces=ball.faces), 0.1)
+    small = cluster_vertices(Mesh(vertices=ball.vertices, faces=ball.faces), 0.1)
     assert 0.01 * len(ball.faces) < len(small.faces) <= 0.1 * len(ball.faces)
     assert np.abs(np.linalg.norm(small.vertices, axis=1) - 1).max() < 0.05
     assert small.faces.max() == len(small.vertices) - 1
-    assert simplified(cube(np.zeros(3)), 1.0).faces.shape == (12, 3)
+    assert cluster_vertices(cube(np.zeros(3)), 1.0).faces.shape == (12, 3)
 
 
 def test_coarse_faces_are_few_closed_and_of_the_same_vertices():

@@ -14,15 +14,14 @@ from more2_jax.network.embedding_batch import embed
 from more2_jax.refinement.joint_of_objects import fit_objects
 from more2_jax.scene import add_scan, reconstruct, start_scene
 from more2_jax.storage.scene_folder import load_scene, save_scene
-from more2_jax.tracking.identify import last_seen
 from more2_jax.tracking.objects import (
     accumulated,
     accumulated_points,
-    last_center,
     new_object,
     points_of,
     seen_again,
 )
+from more2_jax.tracking.relocalize import known_object
 from more2_jax.types import Instance, Observation, Scan, SceneObject
 
 TURNED = turn_z(np.pi, np.zeros(3), np.array([2.0, 0.0, 0.0]))  # back to front, elsewhere
@@ -46,8 +45,7 @@ def test_doubted_points_are_kept_but_no_part_of_the_shape(tiny_prior):
     assert [s.scan for s in accumulated(o)] == [0, 2]
     np.testing.assert_allclose(points_of(o, o.observations[1]), piece(0) + [1.0, 0, 0], atol=1e-9)
     np.testing.assert_allclose(accumulated_points(o), np.tile(piece(0), (2, 1)), atol=1e-9)
-    np.testing.assert_allclose(last_center(o), piece(0).mean(axis=0) + [0, 1.0, 0], atol=1e-9)
-    known, _ = last_seen(o)
+    known, _ = known_object(o, None, CONFIG)
     np.testing.assert_allclose(known.points, np.tile(piece(0), (2, 1)) + [0, 1.0, 0], atol=1e-9)
 
 
