@@ -6,7 +6,6 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from jaxtyping import Float
 from scipy.special import ndtr
 
 from more2_jax.config import SceneConfig
@@ -77,11 +76,6 @@ def points_of(o: SceneObject, seen: Observation) -> Points:
 def observation_in(o: SceneObject, scan: int) -> Observation | None:
     """The object's observation in a scan, if it was there."""
     return next((seen for seen in o.observations if seen.scan == scan), None)
-
-
-def last_center(o: SceneObject) -> Float[np.ndarray, "3"]:
-    """Where the object was when last seen: its accumulated cloud's mean, in the scene's frame."""
-    return apply_pose(place_of(o.observations[-1]), accumulated_points(o).mean(axis=0, keepdims=True))[0]
 
 
 def place_of(seen: Observation) -> Pose:
