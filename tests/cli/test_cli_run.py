@@ -28,11 +28,11 @@ def test_run_then_add(tmp_path, tiny, capsys):
     assert str(out) in told
     scene, config = load_scene(out)
     assert [s.name for s in scene.scans] == ["a", "b"]
-    assert (scene.preset, scene.prior, config.joint.steps, config.matching.score) == (
+    assert (scene.preset, scene.prior, config.joint.steps, config.matching.method) == (
         "robust",
         "tiny",
         2,
-        "inv",
+        "evidence",
     )
     assert "meshing the scene: 2 objects" in (out / "run.log").read_text()
     assert main(["add", str(out), str(c), "--prior", str(tiny)]) == 0
