@@ -61,10 +61,11 @@ def alignable(batch: LocalBatch, search: SurfaceSearch) -> AlignableObject:
 @partial(jax.jit, static_argnames="search")
 def _alignable(batch: LocalBatch, search: SurfaceSearch) -> AlignableObject:
     def one(row: LocalBatch) -> AlignableObject:
-        cloud = row.cloud
-        whole = whole_surface(cloud.points, cloud.mask)
+        mask = row.cloud.mask
+        points = jnp.where(mask[:, None], row.cloud.points, 0.0)  # NaN in masked rows goes no further
+        whole = whole_surface(points, mask)
         coarse = coarsened(whole, search.points, search.dense, search.cells)
-        radius = cloud_radius(cloud.points, cloud.mask)
+        radius = cloud_radius(points, mask)
         return AlignableObject(whole=whole, coarse=coarse, radius=radius, code=row.code, sight=row.sight)
 
     return jax.lax.map(one, batch)

@@ -29,11 +29,11 @@ def test_run_then_add(tmp_path, tiny, capsys):
     assert str(out) in told
     scene, config = load_scene(out)
     assert [s.name for s in scene.scans] == ["a", "b"]
-    assert (scene.preset, scene.prior, config.joint.steps, config.matching.score) == (
+    assert (scene.preset, scene.prior, config.joint.steps, config.matching.method) == (
         "robust",
         "tiny",
         2,
-        "inv",
+        "evidence",
     )
     assert "meshing the scene: 2 objects" in (out / "run.log").read_text()
     assert (out / "report.html").read_text(encoding="utf-8") == report_html(scene, config)
