@@ -20,13 +20,13 @@ from more2_jax.network.vector_neurons import (
     EdgeVNLA,
     VNLAWeights,
     channel_normalize,
+    channel_products,
     edge_vnla,
     kernel_init,
     masked_mean,
     nearest_features,
     nearest_points,
     norm,
-    paired,
     vn_leaky_relu,
 )
 from more2_jax.types import Anchors, Embedding
@@ -124,8 +124,8 @@ class AttentionBlock(nn.Module):
         def score(neighbor: EdgeParts, own: tuple[Array, EdgeParts], _: tuple[()], __: tuple[()]) -> Any:
             asked, parts = own
             found = edge_vnla(neighbor, parts, c.leak)
-            along = jnp.matmul(paired(asked, found), heads, precision="highest")
-            return (), (along, paired(found, found).sum(axis=-1, keepdims=True))
+            along = jnp.matmul(channel_products(asked, found), heads, precision="highest")
+            return (), (along, channel_products(found, found).sum(axis=-1, keepdims=True))
 
         _, (along, squared) = over_neighbors(score, key, (asked, own_key), (), (), index)
         logit = along * jax.lax.rsqrt(3.0 * c.head_channels * jnp.where(squared > TINY, squared, 1.0))
