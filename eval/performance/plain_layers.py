@@ -1,6 +1,6 @@
 """The published layers written down plainly in JAX: every edge's feature is built, stored and multiplied.
 
-The yardstick of eval/speed.py, with our weights: the same outputs to rounding, none of the algebra (METHOD 1).
+The yardstick of eval/speed.py, with our weights: the same outputs to rounding, none of the algebra (paper §3.1).
 """
 
 from __future__ import annotations

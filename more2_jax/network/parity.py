@@ -1,4 +1,4 @@
-"""TODO"""
+"""Parity: a checkpoint's outputs held against a reference, the outputs of the published layers (paper §3.1)."""
 
 from __future__ import annotations
 
@@ -19,8 +19,6 @@ from more2_jax.network.torch_checkpoint import DAMAGED
 from more2_jax.types import Embedding
 
 WEIGHTS = "w/"  # prefix of weights inside a reference file
-
-
 OUTPUTS = ("F_inv", "F_eqv", "F_s", "F_c", "sdf")
 
 

@@ -52,9 +52,7 @@ def channel_products(a: Float[Array, "*b 3 c"], b: Float[Array, "*b 3 c"]) -> Fl
 
 
 @channel_products.defjvp
-def _channel_products_tangent(
-    at: tuple[Array, Array], tangent: tuple[Array, Array]
-) -> tuple[Array, Array]:
+def _channel_products_tangent(at: tuple[Array, Array], tangent: tuple[Array, Array]) -> tuple[Array, Array]:
     (a, b), (d_a, d_b) = at, tangent
     # A reduction, unlike `dot`: the transpose of a reduction is a broadcast, that of slices writes and adds up copies.
     return channel_products(a, b), jnp.sum(d_a * b + a * d_b, axis=-2)

@@ -14,7 +14,7 @@ from more2_jax.network.prior import encode, sdf
 from more2_jax.types import Embedding, PointCloud
 
 REAL = 90, 110  # points of the two clouds; the rest of the rows is padding
-ROWS, QUERIES, STEP = 128, 20, 1e-6
+ROWS, QUERIES, STEP = 128, 20, 1e-8
 MASK = np.arange(ROWS) < np.array(REAL)[:, None]
 OUTPUTS = ("inv", "eqv", "scale", "center", "sdf")
 
@@ -45,7 +45,13 @@ def queries() -> np.ndarray:
 def outputs(points: jax.Array, prior) -> dict[str, jax.Array]:
     """One number an output, which is sensitive to all of its entries."""
     e = encode(prior, as_cloud(points))
-    arrays = {"inv": e.inv, "eqv": e.eqv, "scale": e.scale, "center": e.center, "sdf": sdf(prior, e, queries())}
+    arrays = {
+        "inv": e.inv,
+        "eqv": e.eqv,
+        "scale": e.scale,
+        "center": e.center,
+        "sdf": sdf(prior, e, queries()),
+    }
     return {k: jnp.sum(x * jnp.cos(jnp.arange(x.size)).reshape(x.shape)) for k, x in arrays.items()}
 
 
@@ -89,7 +95,7 @@ def test_forward_over_reverse_agrees_with_differences_of_gradients(prior64):
     slope, curvature = quick_jit(jax.jacrev(of_shift)), quick_jit(jax.hessian(of_shift))
     at = np.zeros(3)
     found = curvature(at, prior64)
-    assert_close(found, differences(lambda x: slope(x, prior64), at), 1e-5)
+    assert_close(found, differences(lambda x: slope(x, prior64), at), 1e-6)
     for name in OUTPUTS:
         np.testing.assert_allclose(found[name], found[name].T, rtol=0, atol=1e-9 * np.abs(found[name]).max())
 
@@ -107,7 +113,9 @@ def test_padding_has_no_gradient_and_real_points_have(prior64):
 def test_a_change_of_all_weights_agrees_with_central_differences(prior64):
     points, leaves = jnp.asarray(clouds()), jax.tree.leaves(prior64)
     rng = np.random.default_rng(3)
-    along = jax.tree.unflatten(jax.tree.structure(prior64), [x.std() * rng.normal(size=x.shape) for x in leaves])
+    along = jax.tree.unflatten(
+        jax.tree.structure(prior64), [x.std() * rng.normal(size=x.shape) for x in leaves]
+    )
 
     def on_the_way(share: jax.Array) -> dict[str, jax.Array]:
         return outputs(points, jax.tree.map(lambda w, d: w + share[0] * d, prior64, along))
