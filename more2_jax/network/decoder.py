@@ -33,7 +33,7 @@ class ObjectField:
 def product(h: Float[Array, "n i"], kernel: Float[Array, "i o"], train: bool) -> Float[Array, "n o"]:
     """h @ kernel; in training, accelerators multiply in bfloat16 and add in float32.
 
-    That costs a distance about 1 % and the gradient less than a batch's noise. Not when a trained field is asked:
+    That costs a distance about 1 % and the gradient less than a batch's noise. Not when a trained field is queried:
     poses are found by its slope, and imported weights should agree with their origin.
     """
     if not train:
@@ -71,9 +71,9 @@ class Decoder(nn.Module):
             LocalLookup(d.local_channels, d.bandwidths, e.widths[i], name=f"local_{i}")
             for i in d.local_blocks
         ]
-        self.looked_up = len(d.local_blocks) * local_width(d.local_channels, len(d.bandwidths))
+        self.local_width = len(d.local_blocks) * local_width(d.local_channels, len(d.bandwidths))
         self.code_width = 2 * e.code + 1
-        self.input_width = self.code_width + self.looked_up
+        self.input_width = self.code_width + self.local_width
         widths = [d.hidden] * d.layers
         if d.narrow_skip:
             # So that the skip layer's input is `hidden` wide again.
@@ -96,17 +96,17 @@ class Decoder(nn.Module):
         first, bias = kernels[0]
         skip, skip_bias = kernels[d.skip_layer]
         return ObjectField(
-            first=self._fold(embedding, first, bias),
-            skip=self._fold(embedding, skip[-self.input_width :], skip_bias),
+            first=self._affine(embedding, first, bias),
+            skip=self._affine(embedding, skip[-self.input_width :], skip_bias),
             scale=embedding.scale,
             center=embedding.center,
             local=tuple(
-                lookup.fold(a, embedding.scale)
+                lookup.tabulate(a, embedding.scale)
                 for lookup, a in zip(self.lookups, embedding.anchors, strict=True)
             ),
         )
 
-    def _fold(self, e: Embedding, kernel: Float[Array, "i h"], bias: Float[Array, " h"]) -> Affine:
+    def _affine(self, e: Embedding, kernel: Float[Array, "i h"], bias: Float[Array, " h"]) -> Affine:
         code = self.config.encoder.code
         of_inv, of_eqv, of_length = kernel[:code], kernel[code : 2 * code], kernel[2 * code : 2 * code + 1]
         matrix = jnp.concatenate([self.config.eqv_gain * (e.eqv @ of_eqv), of_length])
@@ -119,16 +119,16 @@ class Decoder(nn.Module):
         d, kernels = self.config.decoder, self.kernels()
         q = (points - field.center) / field.scale
         length = jnp.sqrt(jnp.maximum(jnp.sum(q * q, axis=-1, keepdims=True), 1e-30))
-        local = [lookup.ask(f, q) for lookup, f in zip(self.lookups, field.local, strict=True)]
+        looked_up = [lookup.query(f, q) for lookup, f in zip(self.lookups, field.local, strict=True)]
         q = jnp.concatenate([q, length], axis=-1)
-        near = jnp.concatenate([q[:, :0], *local], axis=-1)
-        first, skip = (k[len(k) - self.looked_up :] for k in (kernels[0][0], kernels[d.skip_layer][0]))
-        h = self._activate(q @ field.first[0] + field.first[1] + near @ first, train)
+        local_features = jnp.concatenate([q[:, :0], *looked_up], axis=-1)
+        first, skip = (k[len(k) - self.local_width :] for k in (kernels[0][0], kernels[d.skip_layer][0]))
+        h = self._activate(q @ field.first[0] + field.first[1] + local_features @ first, train)
         for i in range(1, d.layers):
             kernel, bias = kernels[i]
             if i == d.skip_layer:
                 kept = product(h, kernel[: -self.input_width], train)
-                h = kept + q @ field.skip[0] + field.skip[1] + near @ skip
+                h = kept + q @ field.skip[0] + field.skip[1] + local_features @ skip
             else:
                 h = product(h, kernel, train) + bias
             h = self._activate(h, train)

@@ -20,13 +20,13 @@ from more2_jax.network.vector_neurons import (
     EdgeVNLA,
     VNLAWeights,
     channel_normalize,
+    channel_products,
     edge_vnla,
     kernel_init,
     masked_mean,
     nearest_features,
     nearest_points,
     norm,
-    paired,
     vn_leaky_relu,
 )
 from more2_jax.types import Anchors, Embedding
@@ -34,12 +34,12 @@ from more2_jax.types import Anchors, Embedding
 Features = Float[Array, "n 3 c"]
 
 
-def divide_by_count(total: Features, real: Bool[Array, "n k"]) -> Features:
+def mean_of_sum(total: Features, real: Bool[Array, "n k"]) -> Features:
     """The mean over the real neighbors, from the sum over them."""
     return total / jnp.maximum(real.sum(axis=-1), 1)[:, None, None]
 
 
-def channels_of(vectors: tuple[Array, Array, Array], kernel: Float[Array, "3 c"]) -> Features:
+def edge_vectors(vectors: tuple[Array, Array, Array], kernel: Float[Array, "3 c"]) -> Features:
     """The vectors (n, 3) side by side, times the kernel: a sum, as three channels make too narrow a product."""
     a, b, c = (vector[..., None] * row for vector, row in zip(vectors, kernel, strict=True))
     return a + b + c
@@ -70,13 +70,13 @@ class FirstBlock(nn.Module):
         def edge(neighbor: Array, own: tuple[Array, Array], maps: tuple[Array, Array], real: Array) -> Any:
             unit, point = own
             graph = jnp.cross(unit, neighbor), neighbor - point, point
-            q, k = (channels_of(graph, w) for w in maps)
+            q, k = (edge_vectors(graph, w) for w in maps)
             return vn_leaky_relu(q, k, c.leak, real[:, None, None]), ()
 
         # The direction is folded into the kernel: no product of matrices an edge.
         maps = (kernel, kernel @ direction)
         own, counted = (points / length[:, None], points), real.T.astype(points.dtype)
-        return divide_by_count(over_neighbors(edge, points, own, maps, counted, index)[0], real)
+        return mean_of_sum(over_neighbors(edge, points, own, maps, counted, index)[0], real)
 
 
 class LinearBlock(nn.Module):
@@ -97,7 +97,7 @@ class LinearBlock(nn.Module):
         def edge(neighbor: EdgeParts, own: EdgeParts, _: tuple[()], real: Array) -> Any:
             return edge_vnla(neighbor, own, c.leak, real[:, None, None]), ()
 
-        return divide_by_count(over_neighbors(edge, of_neighbor, of_self, (), counted, index)[0], real)
+        return mean_of_sum(over_neighbors(edge, of_neighbor, of_self, (), counted, index)[0], real)
 
 
 class AttentionBlock(nn.Module):
@@ -116,19 +116,19 @@ class AttentionBlock(nn.Module):
     ) -> Features:
         c = self.config
         index, real = nearest_features(query, source, mask, c.neighbors)
-        asked = channel_normalize(VNLA(self.features, c.leak, name="query")(query))
+        asking = channel_normalize(VNLA(self.features, c.leak, name="query")(query))
         key, own_key = EdgeVNLA(self.features, name="key")(source, query)
         value, own_value = EdgeVNLA(self.features, name="value")(source, query)
-        heads = membership(self.features, c.head_channels)
+        heads = head_membership(self.features, c.head_channels)
 
         def score(neighbor: EdgeParts, own: tuple[Array, EdgeParts], _: tuple[()], __: tuple[()]) -> Any:
-            asked, parts = own
-            found = edge_vnla(neighbor, parts, c.leak)
-            along = jnp.matmul(paired(asked, found), heads, precision="highest")
-            return (), (along, paired(found, found).sum(axis=-1, keepdims=True))
+            asking, parts = own
+            key = edge_vnla(neighbor, parts, c.leak)
+            product = jnp.matmul(channel_products(asking, key), heads, precision="highest")
+            return (), (product, channel_products(key, key).sum(axis=-1, keepdims=True))
 
-        _, (along, squared) = over_neighbors(score, key, (asked, own_key), (), (), index)
-        logit = along * jax.lax.rsqrt(3.0 * c.head_channels * jnp.where(squared > TINY, squared, 1.0))
+        _, (product, squared) = over_neighbors(score, key, (asking, own_key), (), (), index)
+        logit = product * jax.lax.rsqrt(3.0 * c.head_channels * jnp.where(squared > TINY, squared, 1.0))
         weight = jax.nn.softmax(logit, axis=0, where=real.T[..., None])
 
         def weighted(neighbor: EdgeParts, own: EdgeParts, _: tuple[()], weight: Array) -> Any:
@@ -140,7 +140,7 @@ class AttentionBlock(nn.Module):
         return VNLA(self.features, c.leak, name="context")(jnp.concatenate([mixed, context], axis=-1))
 
 
-def membership(features: int, channels: int) -> Float[np.ndarray, "features heads"]:
+def head_membership(features: int, channels: int) -> Float[np.ndarray, "features heads"]:
     """1 where a channel is of a head: a product with it sums by heads, one with its transpose repeats."""
     return np.repeat(np.eye(features // channels, dtype=np.float32), channels, axis=0)
 

@@ -19,14 +19,18 @@ from jaxtyping import Bool, Float
 from more2_jax.network.vector_neurons import TINY, kernel_init
 from more2_jax.types import Anchors, pytree
 
-EXTRA = 5  # distances, a bandwidth
-CLOSE = 0.02  # canonical units: how far from the plane a query still counts as being at it
-LEAST_SPREAD = 1e-4  # of the anchors, squared: below it one anchor has all the weight, and there is no plane
+POSITIONAL = (
+    5  # features a bandwidth that say where the query lies: three lengths, two of them also as a share
+)
+PLANE_REACH = 0.02  # canonical units: heights over the plane are told apart up to about this
+MIN_VARIANCE = (
+    1e-4  # of the anchors, canonical units²: below it one anchor has all the weight, and there is no plane
+)
 
 
 @pytree
 class LocalField:
-    """One level's anchors, ready to be asked: canonical units, relative to the center."""
+    """One level's anchors, ready to be queried: canonical units, relative to the center."""
 
     position: Float[Array, "a 3"]
     mask: Bool[Array, " a"]
@@ -36,11 +40,11 @@ class LocalField:
 
 def local_width(channels: int, bandwidths: int) -> int:
     """How many numbers a level contributes to the decoder's input."""
-    return bandwidths * (2 * channels + EXTRA)
+    return bandwidths * (2 * channels + POSITIONAL)
 
 
 class LocalLookup(nn.Module):
-    """One level: `fold` once an object, `ask` for many points."""
+    """One level: `tabulate` once an object, `query` for many points."""
 
     channels: int
     bandwidths: tuple[float, ...]
@@ -54,21 +58,21 @@ class LocalLookup(nn.Module):
         self.right = self.param("right", kernel_init, shape)
         self.log_bandwidth = self.param("log_bandwidth", lambda _: jnp.log(jnp.array(self.bandwidths)))
 
-    def fold(self, anchors: Anchors, scale: Float[Array, ""]) -> LocalField:
+    def tabulate(self, anchors: Anchors, scale: Float[Array, ""]) -> LocalField:
         """Every anchor's linear function in absolute form: ⟨p − x, B⟩ + b = ⟨p, B⟩ + (b − ⟨x, B⟩)."""
         features = anchors.features * jnp.sqrt(1.0 * self.inputs)
         position = anchors.offset / scale
         slope = features @ self.slope
         constant = jnp.sum((features @ self.left) * (features @ self.right), axis=-2) / 3.0
-        heads = len(self.bandwidths)
-        by_head = [jnp.split(x, heads, axis=-1) for x in (slope, constant)]
+        count = len(self.bandwidths)
+        by_bandwidth = [jnp.split(x, count, axis=-1) for x in (slope, constant)]
         second = (position[:, :, None] * position[:, None, :]).reshape(-1, 9)
         rows = [
             jnp.concatenate(
                 [s.reshape(len(s), -1), jnp.einsum("ai,aic->ac", position, s), c, position, second],
                 axis=-1,
             )
-            for s, c in zip(*by_head, strict=True)
+            for s, c in zip(*by_bandwidth, strict=True)
         ]
         return LocalField(
             position=position,
@@ -77,62 +81,64 @@ class LocalLookup(nn.Module):
             bandwidth=jnp.exp(self.log_bandwidth),
         )
 
-    def ask(self, field: LocalField, q: Float[Array, "n 3"]) -> Float[Array, "n w"]:
+    def query(self, field: LocalField, q: Float[Array, "n 3"]) -> Float[Array, "n w"]:
         """The blended functions and the distance, for every bandwidth; each of order one, near and far."""
         # −|q − x|²/2 up to what is the same for all anchors
         closeness = jnp.matmul(q, field.position.T, precision="highest") - 0.5 * jnp.sum(
             field.position**2, axis=-1
         )
-        blend = []
+        blended = []
         for table, bandwidth in zip(field.table, field.bandwidth, strict=True):
             weight = jax.nn.softmax(closeness / bandwidth**2, axis=-1, where=field.mask)
             # Positions are in the table, and covariances are small differences of their squares.
-            blend.append(self._blend(q, jnp.matmul(weight, table, precision="highest"), bandwidth))
-        return jnp.concatenate(blend, axis=-1)
+            blended.append(self._features(q, jnp.matmul(weight, table, precision="highest"), bandwidth))
+        return jnp.concatenate(blended, axis=-1)
 
-    def _blend(
+    def _features(
         self, q: Float[Array, "n 3"], mean: Float[Array, "n t"], bandwidth: Array
     ) -> Float[Array, "n w"]:
         c = self.channels
         slope, of_offset, constant, near = jnp.split(mean, (3 * c, 4 * c, 5 * c), axis=-1)
         slope, center, second = slope.reshape(-1, 3, c), near[:, :3], near[:, 3:].reshape(-1, 3, 3)
-        linear = _dot(q, slope) - of_offset
-        offset, across, spread = from_plane(q, center, second)
-        distance = root(jnp.sum(offset**2, axis=-1) + spread)  # root mean square distance to the anchors
-        height = root(jnp.sum(across**2, axis=-1))
+        linear = _products(q, slope) - of_offset
+        offset, normal_offset, variance = plane_offsets(q, center, second)
+        distance = length_of(
+            jnp.sum(offset**2, axis=-1) + variance
+        )  # root mean square distance to the anchors
+        height = length_of(jnp.sum(normal_offset**2, axis=-1))
         return jnp.concatenate(
             [
                 linear / (distance + bandwidth) + constant,
                 distance,
                 distance / (distance + bandwidth),
-                _dot(across, slope) / (height + CLOSE),
+                _products(normal_offset, slope) / (height + PLANE_REACH),
                 height,
-                height / (height + CLOSE),
-                root(spread),
+                height / (height + PLANE_REACH),
+                length_of(variance),
             ],
             axis=-1,
         )
 
 
-def from_plane(
+def plane_offsets(
     q: Float[Array, "n 3"], center: Float[Array, "n 3"], second: Float[Array, "n 3 3"]
 ) -> tuple[Float[Array, "n 3"], Float[Array, "n 3"], Float[Array, " n"]]:
-    """Offsets of queries from their neighborhood's mean, the part of them across its plane, and its spread.
+    """Offsets of queries from their neighborhood's mean, the part of them along its plane's normal, and its variance.
 
-    For points spread evenly in a plane the covariance is s/2 times the projection onto it, s its trace: no
+    For points spread evenly in a plane the covariance is v/2 times the projection onto it, v its trace: no
     eigenvectors, so nothing jumps where two of them change places.
     """
     offset = q - center
     covariance = second - center[:, :, None] * center[:, None, :]
-    spread = jnp.maximum(jnp.trace(covariance, axis1=-2, axis2=-1), LEAST_SPREAD)
-    across = offset - 2 * jnp.einsum("nij,nj->ni", covariance, offset) / spread[:, None]
-    return offset, across, spread
+    variance = jnp.maximum(jnp.trace(covariance, axis1=-2, axis2=-1), MIN_VARIANCE)
+    normal_offset = offset - 2 * jnp.einsum("nij,nj->ni", covariance, offset) / variance[:, None]
+    return offset, normal_offset, variance
 
 
-def root(squared: Float[Array, " n"]) -> Float[Array, "n 1"]:
+def length_of(squared: Float[Array, " n"]) -> Float[Array, "n 1"]:
     """Square root as a column; its gradient at 0 is 0."""
     return jnp.sqrt(jnp.maximum(squared, TINY))[:, None]
 
 
-def _dot(q: Float[Array, "n 3"], vectors: Float[Array, "n 3 c"]) -> Float[Array, "n c"]:
+def _products(q: Float[Array, "n 3"], vectors: Float[Array, "n 3 c"]) -> Float[Array, "n c"]:
     return q[:, :1] * vectors[:, 0] + q[:, 1:2] * vectors[:, 1] + q[:, 2:] * vectors[:, 2]

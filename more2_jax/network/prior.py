@@ -37,23 +37,33 @@ class Prior:
 
 
 def init_prior(config: PriorConfig, key: Array, name: str = "random") -> Prior:
-    """Random weights. Raises ValueError if the last block would choose from fewer points than `neighbors`."""
+    """Random weights. Raises ValueError if a block would choose from fewer points than `neighbors`."""
+    _, shapes = _shapes(config)
+    e, (encoder_key, decoder_key) = config.encoder, jax.random.split(key)
+    points, mask = jnp.zeros((e.points, 3)), jnp.ones(e.points, bool)
+    # Weights depend on the shapes of the inputs alone: compiled, nothing is computed of them.
+    embedding = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+    encoder = jax.jit(Encoder(e, keep=config.decoder.local_blocks).init)(encoder_key, points, mask)
+    decoder = jax.jit(Decoder(config).init)(decoder_key, embedding, points[:1])
+    params = {"encoder": dict(encoder["params"]), "decoder": dict(decoder["params"])}
+    return Prior(params=params, config=config, name=name)
+
+
+def _shapes(config: PriorConfig) -> tuple[dict[str, Any], Embedding]:
+    """Shapes and dtypes of all weights, and of the embedding of one cloud; computes nothing.
+
+    Raises ValueError if a block would choose from fewer points than `neighbors`.
+    """
     e = config.encoder
     if (least := min(neighbor_counts(e, e.points))) < e.neighbors:
         raise ValueError(f"{e.points} points leave a block {least}; needed {e.neighbors} neighbors or more")
-    encoder_key, decoder_key = jax.random.split(key)
-    points = jax.random.normal(encoder_key, (e.points, 3))
-    mask = jnp.ones(e.points, bool)
-    encoder, embedding = _initialize(Encoder(e, keep=config.decoder.local_blocks), encoder_key, points, mask)
-    decoder, _ = _initialize(Decoder(config), decoder_key, embedding, points[:1])
-    return Prior(params={"encoder": encoder, "decoder": decoder}, config=config, name=name)
-
-
-def _initialize(module: Encoder | Decoder, key: Array, *inputs: Any) -> tuple[dict[str, Any], Any]:
-    """Weights, and zeros in the output's shapes: no weight depends on the inputs, so nothing is computed of them."""
-    output, _ = jax.eval_shape(module.init_with_output, key, *inputs)
-    variables = jax.jit(module.init)(key, *inputs)
-    return dict(variables["params"]), jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), output)
+    key = jax.eval_shape(lambda: jax.random.key(0))
+    points, one = (jax.ShapeDtypeStruct((n, 3), jnp.float32) for n in (e.points, 1))
+    mask = jax.ShapeDtypeStruct((e.points,), bool)
+    encoder = Encoder(e, keep=config.decoder.local_blocks)
+    embedding, of_encoder = jax.eval_shape(encoder.init_with_output, key, points, mask)
+    of_decoder = jax.eval_shape(Decoder(config).init, key, embedding, one)
+    return {"encoder": of_encoder["params"], "decoder": of_decoder["params"]}, embedding
 
 
 def encode_ordered(prior: Prior, points: Float[Array, "n 3"], mask: Bool[Array, " n"]) -> Embedding:
@@ -75,14 +85,18 @@ def _encode_many(prior: Prior, points: Float[Array, "b n 3"], mask: Bool[Array, 
 def encode(prior: Prior, cloud: PointCloud) -> Embedding:
     """Encodes a batch of clouds (from `pad_clouds`): Φ(sRX + t) = (F_inv, R·F_eqv, s·F_s, sR·F_c + t), paper §3.1.
 
-    Returns a batch of embeddings whose `center` is in meters relative to `origin`, which is the cloud's.
-    Raises ValueError when a cloud has no real point.
+    Returns a batch of embeddings whose `center` is in meters relative to `origin`, which is the cloud's. Points, mask
+    and weights may be traced: a mask is then taken as it is. Raises ValueError for points that are no batch of clouds,
+    a mask of another shape, and a cloud that is known to have no real point.
     """
-    if cloud.points.ndim != 3:
-        raise ValueError(f"encode got points of shape {cloud.points.shape}; needed (batch, n, 3)")
-    if not isinstance(cloud.mask, Tracer) and (empty := np.flatnonzero(~np.asarray(cloud.mask.any(-1)))).size:
+    points, mask = cloud.points, cloud.mask
+    if points.ndim != 3 or points.shape[-1] != 3:
+        raise ValueError(f"encode got points of shape {points.shape}; needed (batch, n, 3)")
+    if mask.shape != points.shape[:2]:
+        raise ValueError(f"encode got a mask of shape {mask.shape}; needed {points.shape[:2]}, as the points")
+    if not isinstance(mask, Tracer) and (empty := np.flatnonzero(~np.asarray(mask).any(-1))).size:
         raise ValueError(f"clouds {empty.tolist()} have no points; encode needs at least one each")
-    return dataclasses.replace(_encode_many(prior, cloud.points, cloud.mask), origin=cloud.origin)
+    return dataclasses.replace(_encode_many(prior, points, mask), origin=cloud.origin)
 
 
 def check_embedding(prior: Prior, embedding: Embedding, who: str) -> None:
@@ -122,17 +136,20 @@ def sdf(
 ) -> Float[Array, "b n"]:
     """Signed distances of a batch of objects at points in each scan's frame (meters), canonical units.
 
-    Multiply by `embedding.scale` for meters; negative inside (paper §3.1). Raises ValueError on shapes that differ, and
-    on embeddings that the decoder cannot be asked about.
+    Multiply by `embedding.scale` for meters; negative inside (paper §3.1). Points, embedding and weights may be traced.
+    Points are moved to the embedding's origin in the precision they come in (float64 where both lie on the host), then
+    asked in the embedding's. Raises ValueError on shapes that differ, and on embeddings that the decoder cannot be
+    asked about.
     """
     check_embedding(prior, embedding, "sdf")
-    if points.ndim != 3 or points.shape[0] != embedding.scale.shape[0]:
+    if points.ndim != 3 or points.shape[-1] != 3 or points.shape[:1] != embedding.scale.shape:
         raise ValueError(
             f"sdf got points {points.shape} for {embedding.scale.shape} objects; needed (objects, n, 3)"
         )
     if embedding.origin is not None:
         points = points - embedding.origin[:, None]
-    return _sdf_many(prior, dataclasses.replace(embedding, origin=None), jnp.asarray(points, jnp.float32))
+    local = jnp.asarray(points, embedding.scale.dtype)
+    return _sdf_many(prior, dataclasses.replace(embedding, origin=None), local)
 
 
 def save_prior(prior: Prior, path: str | Path, half: bool = True) -> None:
@@ -184,7 +201,7 @@ def shipped_priors() -> list[str]:
 
 def check_shapes(prior: Prior, where: str) -> None:
     """Raises ValueError, naming the first array that is missing, unknown or of another shape."""
-    model = jax.eval_shape(lambda key: init_prior(prior.config, key).params, jax.random.key(0))
+    model, _ = _shapes(prior.config)
     needed, got = ({k: jnp.shape(v) for k, v in _flat(tree).items()} for tree in (model, prior.params))
     for name in sorted(needed | got):
         if needed.get(name) != got.get(name):

@@ -1,4 +1,4 @@
-"""The published checkpoint's names and layouts, and ours (METHOD 1)."""
+"""The published checkpoint's names and layouts of weights, and ours (paper §3.1)."""
 
 from __future__ import annotations
 

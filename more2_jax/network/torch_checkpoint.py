@@ -211,6 +211,3 @@ def _load(archive: zipfile.ZipFile, folder: str, tensor: StoredTensor, order: st
     strides = [s * raw.itemsize for s in tensor.strides]
     view = np.lib.stride_tricks.as_strided(raw[tensor.offset :], tensor.shape, strides, writeable=False)
     return view.copy()
-
-
-# --- parity -------------------------------------------------------------------------------------------------

@@ -14,7 +14,7 @@ from places import ROOT
 
 from more2_jax.config import load_config
 from more2_jax.geometry.transform import rescale, transform
-from more2_jax.network.local_field import LEAST_SPREAD, LocalLookup, from_plane, local_width
+from more2_jax.network.local_field import MIN_VARIANCE, LocalLookup, local_width, plane_offsets
 from more2_jax.network.prior import encode_one, init_prior, sdf_one
 from more2_jax.types import Anchors
 from train.run.settings import TrainingRun
@@ -36,12 +36,12 @@ def random_anchors(count: int, seed: int = 0) -> Anchors:
 @pytest.fixture(scope="module")
 def lookup():
     module = LocalLookup(CHANNELS, BANDWIDTHS, INPUTS)
-    params = module.init(jax.random.key(1), random_anchors(5), jnp.float32(1.0), method="fold")
+    params = module.init(jax.random.key(1), random_anchors(5), jnp.float32(1.0), method="tabulate")
 
     @jax.jit
     def asked(params, anchors: Anchors, scale: jax.Array, q: jax.Array) -> jax.Array:
         bound = module.bind(params)
-        return bound.ask(bound.fold(anchors, scale), q)
+        return bound.query(bound.tabulate(anchors, scale), q)
 
     def ask(anchors: Anchors, scale: float, q: np.ndarray) -> np.ndarray:
         return np.asarray(asked(params, anchors, jnp.float32(scale), jnp.asarray(q, jnp.float32)))
@@ -69,7 +69,7 @@ def one_by_one(params, anchors: Anchors, scale: float, q: np.ndarray) -> np.ndar
             constant = sum(k * c for k, c in zip(w, constants, strict=True))
             mean = w @ positions
             covariance = np.einsum("a,ai,aj->ij", w, positions - mean, positions - mean)
-            spread = max(np.trace(covariance), LEAST_SPREAD)
+            spread = max(np.trace(covariance), MIN_VARIANCE)
             across = p - mean - 2 * covariance @ (p - mean) / spread
             distance = np.sqrt((p - mean) @ (p - mean) + spread)
             height = np.linalg.norm(across)
@@ -119,7 +119,7 @@ def test_across_is_the_signed_distance_from_a_plane():
     q = np.array([[0.05, -0.08, 0.03], [0.2, 0.0, -0.01], [0.0, 0.0, 0.0]])
     second = np.einsum("ai,aj->ij", disc, disc) / len(disc)
     tiled = (jnp.asarray(np.tile(x, (3, *[1] * x.ndim)), jnp.float32) for x in (disc.mean(axis=0), second))
-    _, across, spread = from_plane(jnp.asarray(q, jnp.float32), *tiled)
+    _, across, spread = plane_offsets(jnp.asarray(q, jnp.float32), *tiled)
     np.testing.assert_allclose(across, q * [0, 0, 1], atol=3e-3)
     np.testing.assert_allclose(spread, 0.02, rtol=0.03)
 
