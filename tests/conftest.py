@@ -13,7 +13,9 @@ from places import ROOT
 # Before anything of more2_jax is imported: every call's shapes and dtypes are held against its annotations. Not in
 # UNCHECKED: records that pass through JAX's transformations, which fill them with stand-ins of any kind.
 UNCHECKED = {"types"}
-MODULES = {".".join(path.relative_to(ROOT).with_suffix("").parts) for path in (ROOT / "more2_jax").rglob("*.py")}
+MODULES = {
+    ".".join(path.relative_to(ROOT).with_suffix("").parts) for path in (ROOT / "more2_jax").rglob("*.py")
+}
 install_import_hook(sorted(MODULES - {f"more2_jax.{name}" for name in UNCHECKED}), "beartype.beartype")
 jax.config.update("jax_default_matmul_precision", "highest")
 
