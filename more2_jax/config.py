@@ -140,7 +140,7 @@ class SurfaceRegistration:
     )
     field_points: int = 1024  # of each cloud, asked of the other's completed surface
     polish_points: int = 512  # then, for the best pose alone
-    polish_steps: int = 10
+    polish_steps: int = 10  # of alignment, of the best pose
     polish_reach: float = 0.02  # of a correspondence, in its last step
     trim: float = 0.7  # share of nearest distances that counts in the residual
     converged_rms: float = 0.05  # residual below which a pose that has settled is called converged
@@ -161,10 +161,10 @@ class JointConfig:
     start: Literal["best", "accumulated"] = (
         "best"  # F_0: the code of the observation with the lowest loss, or that of all together
     )
-    eqv_learning_rate: float = 1e-4
-    pose_learning_rate: float = 5e-5
-    inv_learning_rate: float = 1e-5
-    center_learning_rate: float = 1e-5
+    eqv_learning_rate: float = 1e-4  # of Adam, for F_eqv,
+    pose_learning_rate: float = 5e-5  # the poses (radians, and shares of the radius),
+    inv_learning_rate: float = 1e-5  # F_inv,
+    center_learning_rate: float = 1e-5  # and F_c
 
 
 @dataclass(frozen=True)
@@ -279,7 +279,7 @@ NOW_CONSTANT: dict[str, dict[str, Any]] = {
 }
 
 
-def from_dict(cls: type[C], values: dict[str, Any], where: str = "") -> C:
+def from_dict(cls: type[C], values: Any, where: str = "") -> C:
     """Builds dataclass `cls` from plain values; raises ValueError on keys it does not have or wrong types."""
     if not isinstance(values, dict):
         raise ValueError(f"{where or 'settings'}: got {values!r}, needed a mapping")

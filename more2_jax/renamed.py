@@ -142,7 +142,7 @@ NAMES = {
         "more2_jax.geometry.poses": "local_pose",
     },
     "frames": {
-        "more2_jax.geometry.floor": "FLOOR_SHARE LAYER_M STRAY floor_height",
+        "more2_jax.geometry.floor": "LAYER_M floor_height",
         "more2_jax.geometry.poses": "lift",
         "more2_jax.geometry.transform": "moved moved_embedding",
         "more2_jax.tracking.scan_height": "AS_GOOD_VOTES CLEARLY LEAST_M Rooms SPREAD_M "
@@ -169,6 +169,7 @@ NAMES = {
     },
 }
 CALLED = {
+    "close_objects": "refine_object_poses",
     "Known": "ObservedObject",
     "in_frames": "world_poses",
     "lift": "vertical_shift",

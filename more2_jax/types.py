@@ -12,7 +12,7 @@ import jax
 import jaxlie
 import numpy as np
 from jax import Array
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Integer
 
 T = TypeVar("T")
 
@@ -149,7 +149,7 @@ class LocalBatch:
     sight: Sight | None = quantity("record", default=None)
     origin: Float[Array | np.ndarray, "*batch 3"] | None = quantity("origin", default=None)
 
-    def take(self, rows: Sequence[int] | Int[np.ndarray, " k"]) -> LocalBatch:
+    def take(self, rows: Sequence[int] | Integer[np.ndarray, " k"]) -> LocalBatch:
         """The objects in `rows`, in that order."""
         at = np.asarray(rows, int)
         local = dataclasses.replace(self, origin=None)
@@ -161,7 +161,7 @@ class LocalBatch:
 class Matches:
     """An assignment of the objects of one scan to those of another (paper §3.2)."""
 
-    target_index: Int[Array, "*batch sources"]  # −1: no partner
+    target_index: Integer[Array, "*batch sources"]  # −1: no partner
     score: Float[Array, "*batch sources"]  # the entry of H (or Λ) that was chosen; 0 without partner
 
 
@@ -203,7 +203,7 @@ class Mesh:
     """A triangle mesh; meters."""
 
     vertices: Float[np.ndarray, "v 3"]
-    faces: Int[np.ndarray, "f 3"]
+    faces: Integer[np.ndarray, "f 3"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -221,7 +221,7 @@ class Instance:
     id: int
     points: Float[np.ndarray, "n 3"]
     label: str | None = None
-    colors: Int[np.ndarray, "n 3"] | None = None  # uint8
+    colors: Integer[np.ndarray, "n 3"] | None = None  # uint8
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -302,7 +302,7 @@ class SceneObject:
     reference_scan: int
     observations: tuple[Observation, ...]
     points: Float[np.ndarray, "n 3"]  # float64
-    point_scan: Int[np.ndarray, "n"]
+    point_scan: Integer[np.ndarray, "n"]
     embedding: Embedding  # NumPy leaves, unbatched; frame of the reference observation
     mesh: Mesh | None = None
     color: Color | None = None  # of the accumulated observations whose scans have colors

@@ -31,7 +31,7 @@ def written(path) -> list[dict]:
 def test_a_stage_tells_its_counts_in_order_and_adds_its_seconds():
     told: list[Progress] = []
     timing = {"register": 1.0}
-    with staged(timing, told.append, "register", 3, scan="b", unit="pairs") as advance:
+    with staged(timing, told.append, "register", 3, scan="b") as advance:
         advance(2)
     assert [(p.event, p.done, p.total) for p in told] == [
         ("started", 0, 3),

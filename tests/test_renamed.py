@@ -28,7 +28,7 @@ data.procedural.backs data.procedural.fronts data.procedural.furniture data.proc
 data.procedural.parts data.procedural.seating data.procedural.soft data.procedural.storage
 data.procedural.supports data.procedural.tables data.rgbd_sequence data.sampling data.scans
 data.segment_groups data.segmentation data.shapenet data.shapes data.shards data.signed_distance
-data.solids data.source_mesh data.structural data.sweethome3d 
+data.solids data.source_mesh data.structural data.threerscan_index data.sweethome3d 
 decoder demo descent encoder encoding evidence fitting frames in_turn io joint lattice local_field
 losses meshfile nearest_grid neighbours objects orientation outliers planes pose_graph prior published
 screened_poisson seen_surface sight sights starts surface_registration verification vn
@@ -48,6 +48,8 @@ geometry.chamfer_distance prior.Prior prior.init_prior prior.load_prior prior.sa
 FORMER, KEPT, DOCUMENTED = FORMER_LIST.split(), KEPT_LIST.split(), DOCUMENTED_LIST.split()
 # A module has the place of a function now: these two are reached by `more2_jax.register` and the command `more2`.
 HIDDEN = {("registration", "register"), ("cli", "main")}
+# Functions of today in modules of their own name: 0.1.0 had neither.
+NEW = {("meshing", "observed_surface"), ("tracking", "identify")}
 
 
 def former(module: str, monkeypatch):
@@ -132,7 +134,7 @@ def test_former_names_hide_no_new_module():
         parts = {m.name for m in pkgutil.iter_modules([str(ROOT / "more2_jax" / package)])}
         home = importlib.import_module(renamed.MODULES[package])
         hidden |= {(package, name) for name in parts & set(own_names(home))}
-    assert hidden == HIDDEN
+    assert hidden - NEW == HIDDEN
     from more2_jax.geometry import padding, points  # modules, and no warning
 
     assert (padding.__name__, points.__name__) == ("more2_jax.geometry.padding", "more2_jax.geometry.points")

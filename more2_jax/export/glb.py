@@ -76,7 +76,7 @@ def _animator(
 ) -> Callable[[dict[str, bytes], dict[str, Any]], None]:
     """What trimesh calls with its buffers and glTF tree before it packs them: adds poses and the animation."""
 
-    def add(buffers: dict[str, bytes], tree: dict[str, Any]) -> None:
+    def add(buffers: dict[Any, Any], tree: dict[str, Any]) -> None:
         scans = len(next(iter(channels.values()))["scale"][0])
         times = _accessor(buffers, tree, "times", SECONDS_PER_SCAN * np.arange(scans))
         animation: dict[str, Any] = {"name": "scans", "samplers": [], "channels": []}
@@ -97,7 +97,7 @@ def _animator(
     return add
 
 
-def _accessor(buffers: dict[str, bytes], tree: dict[str, Any], key: str, values: np.ndarray) -> int:
+def _accessor(buffers: dict[Any, Any], tree: dict[str, Any], key: str, values: np.ndarray) -> int:
     """Appends float32 values to the file's buffer; returns the number of their accessor."""
     values = values.astype("<f4")
     buffers[key] = values.tobytes()

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Integer
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
@@ -58,7 +58,7 @@ class Plane:
 class Segmentation:
     """Clusters as instances, and what was looked at."""
 
-    instance: Int[np.ndarray, "n"]  # from 1, largest first; 0 is background
+    instance: Integer[np.ndarray, "n"]  # from 1, largest first; 0 is background
     planes: tuple[Plane, ...]
     skipped: tuple[Skipped, ...]
 
@@ -94,7 +94,7 @@ def segment_geometric(points: Float[np.ndarray, "n 3"], config: SegmentationConf
 
 def _voxels(
     points: Float[np.ndarray, "n 3"], size_m: float
-) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "n"]]:
+) -> tuple[Float[np.ndarray, "v 3"], Integer[np.ndarray, "n"]]:
     """Centroids of the occupied voxels, in an order that does not depend on the points', and whose is whose."""
     low = points.min(axis=0)
     extent = float((points.max(axis=0) - low).max())
@@ -219,8 +219,8 @@ def _words(plane: Plane) -> str:
 
 
 def _clusters(
-    voxels: Float[np.ndarray, "v 3"], counts: Int[np.ndarray, "v"], config: SegmentationConfig
-) -> Int[np.ndarray, "v"]:
+    voxels: Float[np.ndarray, "v 3"], counts: Integer[np.ndarray, "v"], config: SegmentationConfig
+) -> Integer[np.ndarray, "v"]:
     """DBSCAN whose radius follows the spacing of the points (`counts` a voxel); -1 for noise."""
     cluster = np.full(len(voxels), -1)
     k = min(config.normal_neighbors, len(voxels) - 1)
@@ -249,8 +249,8 @@ def _clusters(
 
 
 def _joined(
-    voxels: Float[np.ndarray, "v 3"], cluster: Int[np.ndarray, "v"], config: SegmentationConfig
-) -> Int[np.ndarray, "v"]:
+    voxels: Float[np.ndarray, "v 3"], cluster: Integer[np.ndarray, "v"], config: SegmentationConfig
+) -> Integer[np.ndarray, "v"]:
     """Pieces given to the nearest other cluster, the smallest first: a leg to its table."""
     cluster = cluster.copy()
     ids, counts = np.unique(cluster[cluster >= 0], return_counts=True)
@@ -269,10 +269,10 @@ def _joined(
 
 def _without_flat(
     voxels: Float[np.ndarray, "v 3"],
-    cluster: Int[np.ndarray, "v"],
+    cluster: Integer[np.ndarray, "v"],
     planes: tuple[Plane, ...],
     config: SegmentationConfig,
-) -> Int[np.ndarray, "v"]:
+) -> Integer[np.ndarray, "v"]:
     """Without patches of floors and walls: sensors warp a wall at the border of their view."""
     cluster = cluster.copy()
     for plane in planes:
@@ -287,10 +287,10 @@ def _without_flat(
 
 def _numbered(
     voxels: Float[np.ndarray, "v 3"],
-    cluster: Int[np.ndarray, "v"],
-    voxel_of: Int[np.ndarray, "n"],
+    cluster: Integer[np.ndarray, "v"],
+    voxel_of: Integer[np.ndarray, "n"],
     config: SegmentationConfig,
-) -> tuple[Int[np.ndarray, "n"], tuple[Skipped, ...]]:
+) -> tuple[Integer[np.ndarray, "n"], tuple[Skipped, ...]]:
     """Instance of every point: clusters large enough to be objects, from 1 by their points; the rest told."""
     ids = np.unique(cluster[cluster >= 0])
     points = np.bincount(cluster[voxel_of] + 1, minlength=ids.max(initial=0) + 2)[1:]

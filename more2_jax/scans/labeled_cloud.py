@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Integer
 
 from more2_jax.types import Skipped
 
@@ -40,8 +40,8 @@ class LabeledCloud:
     """Points with the instance they belong to."""
 
     points: Float[np.ndarray, "n 3"]  # float64, in the file's unit
-    instance: Int[np.ndarray, "n"] | None  # 0 and negative: background; None: the file has no masks
-    colors: Int[np.ndarray, "n 3"] | None = None  # uint8
+    instance: Integer[np.ndarray, "n"] | None  # 0 and negative: background; None: the file has no masks
+    colors: Integer[np.ndarray, "n 3"] | None = None  # uint8
     point_labels: np.ndarray | None = None  # (n,) str or integer
     labels: dict[int, str] = field(default_factory=dict)  # instance → label, where the format says it once
     skipped: tuple[Skipped, ...] = ()
@@ -64,7 +64,7 @@ def one_line(error: BaseException) -> str:
     return "".join(c if c.isprintable() else "?" for c in text)[:300]
 
 
-def instance_ids(path: Path, values: Int[np.ndarray, "n"]) -> Int[np.ndarray, "n"]:
+def instance_ids(path: Path, values: Integer[np.ndarray, "n"]) -> Integer[np.ndarray, "n"]:
     """Whole numbers of any type as int64. ValueError, in one line, where they do not fit."""
     if values.dtype.kind == "u" and values.max(initial=0) > np.iinfo(np.int64).max:
         raise ValueError(f"{path}: instance {values.max()} is too large; needed less than 2⁶³")

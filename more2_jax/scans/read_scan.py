@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Integer
 
 from more2_jax.scans.formats.registry import FORMATS, WITH_DEPTH_FRAMES
 from more2_jax.scans.geometric_segmentation import SegmentationConfig, segment_geometric
@@ -169,7 +169,10 @@ def sensors_of(path: Path, cloud: LabeledCloud) -> Float[np.ndarray, "s 3"]:
 
 
 def _instances(
-    cloud: LabeledCloud, instance: Int[np.ndarray, " n"], points: Float[np.ndarray, "n 3"], min_points: int
+    cloud: LabeledCloud,
+    instance: Integer[np.ndarray, " n"],
+    points: Float[np.ndarray, "n 3"],
+    min_points: int,
 ) -> tuple[tuple[Instance, ...], tuple[Skipped, ...]]:
     """Splits the points by instance in one sort; ids ascend, points keep the file's order."""
     order = np.argsort(instance, kind="stable")

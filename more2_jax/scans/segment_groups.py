@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Integer
 
 from more2_jax.scans.files.json_file import read_json
 from more2_jax.scans.files.ply_cloud import PlyCloud
@@ -29,7 +29,7 @@ class SegmentGroup:
 
     id: int
     label: str | None
-    segments: Int[np.ndarray, "s"]
+    segments: Integer[np.ndarray, "s"]
 
 
 def whole_number(value: Any, where: str) -> int:
@@ -45,7 +45,7 @@ def whole_number(value: Any, where: str) -> int:
     return value
 
 
-def whole_numbers(values: Any, where: str) -> Int[np.ndarray, "n"]:
+def whole_numbers(values: Any, where: str) -> Integer[np.ndarray, "n"]:
     """A list of ids as int64; strings are numbers too."""
     if not isinstance(values, list):
         raise ValueError(f"{where}: got {type(values).__name__}; needed a list of whole numbers")
@@ -85,7 +85,7 @@ def _group(where: str, row: Any, with_segments: bool) -> SegmentGroup:
     return SegmentGroup(id=number, label=label, segments=np.asarray(found, np.int64))
 
 
-def read_segment_indices(path: Path, count: int) -> Int[np.ndarray, "n"]:
+def read_segment_indices(path: Path, count: int) -> Integer[np.ndarray, "n"]:
     """The segment of every vertex. ValueError, in one line, if there are not `count` of them."""
     content = read_json(path)
     values = content.get("segIndices") if isinstance(content, dict) else None
@@ -96,8 +96,8 @@ def read_segment_indices(path: Path, count: int) -> Int[np.ndarray, "n"]:
 
 
 def instances_of(
-    groups: tuple[SegmentGroup, ...], indices: Int[np.ndarray, "n"], shift: int
-) -> tuple[Int[np.ndarray, "n"], dict[int, str], tuple[Skipped, ...]]:
+    groups: tuple[SegmentGroup, ...], indices: Integer[np.ndarray, "n"], shift: int
+) -> tuple[Integer[np.ndarray, "n"], dict[int, str], tuple[Skipped, ...]]:
     """Instance of every vertex (`id + shift`, 0 outside all groups), their labels, and groups without vertices.
 
     Where groups share a segment the later in the file has it; groups of one id are one instance, which has
@@ -125,7 +125,7 @@ def instances_of(
 
 
 def labeled_by_groups(
-    cloud: PlyCloud, groups: tuple[SegmentGroup, ...], indices: Int[np.ndarray, "n"], shift: int
+    cloud: PlyCloud, groups: tuple[SegmentGroup, ...], indices: Integer[np.ndarray, "n"], shift: int
 ) -> LabeledCloud:
     """The vertices, each in the instance that its segment belongs to; walls, floors and the like are background."""
     instance, labels, empty = instances_of(groups, indices, shift)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Integer
 
 from more2_jax.types import Skipped
 
@@ -35,8 +35,8 @@ def is_background(label: str | None) -> bool:
 
 
 def drop_background(
-    instance: Int[np.ndarray, "n"], labels: dict[int, str]
-) -> tuple[Int[np.ndarray, "n"], tuple[Skipped, ...]]:
+    instance: Integer[np.ndarray, "n"], labels: dict[int, str]
+) -> tuple[Integer[np.ndarray, "n"], tuple[Skipped, ...]]:
     """Instances with the structural ones set to 0, and one line on each of those that has points."""
     structural = [i for i, label in labels.items() if is_background(label)]
     gone = np.isin(instance, structural)

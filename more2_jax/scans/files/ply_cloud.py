@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Integer
 from plyfile import PlyData, PlyParseError
 
 from more2_jax.scans.labeled_cloud import one_line
@@ -30,7 +30,7 @@ class PlyCloud:
         return [k for k, v in self.properties.items() if v.dtype.kind in "iu" and k not in COLOR_PROPERTIES]
 
     @property
-    def colors(self) -> Int[np.ndarray, "n 3"] | None:
+    def colors(self) -> Integer[np.ndarray, "n 3"] | None:
         """Red, green, blue as uint8; None where the file has none. Float colors are taken as shares of 1."""
         if not all(c in self.properties for c in COLOR_PROPERTIES):
             return None

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Integer
 from plyfile import PlyListProperty
 
 from more2_jax.scans.files.ply_cloud import CORNERS, PlyCloud, cloud_of, read_elements
@@ -17,8 +17,8 @@ class PlyMesh:
     """Vertices, and the corners of all faces end to end."""
 
     cloud: PlyCloud
-    corners: Int[np.ndarray, "c"]  # vertex of each corner
-    face: Int[np.ndarray, "c"]  # face of each corner
+    corners: Integer[np.ndarray, "c"]  # vertex of each corner
+    face: Integer[np.ndarray, "c"]  # face of each corner
     face_properties: dict[str, np.ndarray]  # scalar properties: name → (faces,)
 
 

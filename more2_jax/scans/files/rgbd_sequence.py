@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Integer
 
 from more2_jax.scans.labeled_cloud import UNREADABLE, one_line
 
@@ -136,7 +136,7 @@ def _floats(values: dict[str, list[str]], name: str, count: int, where: str) -> 
     return numbers
 
 
-def read_pgm(content: bytes, where: str) -> Int[np.ndarray, "h w"]:
+def read_pgm(content: bytes, where: str) -> Integer[np.ndarray, "h w"]:
     """A binary PGM of 8 or 16 bits. ValueError, in one line, if it is damaged or cut short."""
     header = PGM.match(content[:1024])
     if header is None:
@@ -168,7 +168,7 @@ def is_rigid(T: Float[np.ndarray, "4 4"]) -> bool:
 
 
 def back_project(
-    depth: Int[np.ndarray, "h w"],
+    depth: Integer[np.ndarray, "h w"],
     intrinsics: Intrinsics,
     T_world_camera: Float[np.ndarray, "4 4"],
     stride: int,

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Integer
 
 from more2_jax.scans.files.ply_cloud import INSTANCE_PROPERTIES
 from more2_jax.scans.labeled_cloud import LabeledCloud, ReadOptions, instance_ids, one_line
@@ -142,6 +142,6 @@ def _instance_name(path: Path, integers: list[str], options: ReadOptions) -> str
     return next((name for name in INSTANCE_PROPERTIES if name in integers), None)
 
 
-def _eight_bits(colors: Int[np.ndarray, "n 3"]) -> Int[np.ndarray, "n 3"]:
+def _eight_bits(colors: Integer[np.ndarray, "n 3"]) -> Integer[np.ndarray, "n 3"]:
     """LAS holds 16 bits a channel; writers that put 8 bits there never exceed 255."""
     return (colors >> 8 if colors.max(initial=0) > 255 else colors).astype(np.uint8)

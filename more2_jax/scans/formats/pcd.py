@@ -9,7 +9,7 @@ from pathlib import Path
 
 import lzf
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Integer
 
 from more2_jax.scans.files.ply_cloud import INSTANCE_PROPERTIES
 from more2_jax.scans.labeled_cloud import LabeledCloud, ReadOptions
@@ -101,7 +101,7 @@ def _instance_field(path: Path, columns: dict[str, np.ndarray], options: ReadOpt
     )
 
 
-def _whole(path: Path, values: np.ndarray) -> Int[np.ndarray, "n"]:
+def _whole(path: Path, values: np.ndarray) -> Integer[np.ndarray, "n"]:
     if values.dtype.kind == "u" and values.max(initial=0) > np.iinfo(np.int64).max:
         raise ValueError(f"{path}: instance {values.max()} is too large; needed less than 2⁶³")
     return values.astype(np.int64)

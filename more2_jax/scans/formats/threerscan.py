@@ -11,7 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Integer
 from scipy.spatial import KDTree
 
 from more2_jax.scans.files.ply_cloud import PlyCloud, read_ply
@@ -84,7 +84,7 @@ def _first(folder: Path, names: tuple[str, ...]) -> Path | None:
     return next((folder / name for name in names if (folder / name).is_file()), None)
 
 
-def _instances(path: Path, cloud: PlyCloud) -> Int[np.ndarray, "n"]:
+def _instances(path: Path, cloud: PlyCloud) -> Integer[np.ndarray, "n"]:
     if OBJECT not in cloud.integer_properties:
         has = ", ".join(cloud.properties) or "nothing"
         raise ValueError(f"{path}: vertices have {has}; needed a whole number {OBJECT}")
@@ -92,7 +92,7 @@ def _instances(path: Path, cloud: PlyCloud) -> Int[np.ndarray, "n"]:
 
 
 def _labels(
-    folder: Path, instance: Int[np.ndarray, "n"]
+    folder: Path, instance: Integer[np.ndarray, "n"]
 ) -> tuple[dict[int, str], tuple[Skipped, ...], tuple[str, ...]]:
     """Labels by object, objects without vertices, and a warning where the file is missing."""
     file = _first(folder, LABELS)
@@ -159,8 +159,8 @@ def depth_points(
 
 
 def nearest_instance(
-    vertices: Float[np.ndarray, "v 3"], instance: Int[np.ndarray, "v"], points: Float[np.ndarray, "n 3"]
-) -> Int[np.ndarray, "n"]:
+    vertices: Float[np.ndarray, "v 3"], instance: Integer[np.ndarray, "v"], points: Float[np.ndarray, "n 3"]
+) -> Integer[np.ndarray, "n"]:
     """The instance of the nearest vertex within `NEAREST_M`, else 0."""
     _, nearest = KDTree(vertices).query(points, distance_upper_bound=NEAREST_M, workers=-1)
     return np.append(instance, 0)[nearest]  # the tree answers len(vertices) where nothing is near
