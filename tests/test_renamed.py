@@ -81,7 +81,7 @@ def test_a_former_module_warns_and_holds_what_the_new_one_does(module, monkeypat
         old = former(module, monkeypatch)
     new = importlib.import_module(home)
     for name in own_names(new):
-        with pytest.warns(DeprecationWarning, match=rf"\.{name} is more2_jax\.|\.{name} is train\."):
+        with pytest.warns(DeprecationWarning, match=rf"\.{name} is (more2_jax|train|eval)\."):
             assert getattr(old, name) is not None
     with pytest.raises(AttributeError, match="no attribute 'nonsense'"):
         _ = old.nonsense

@@ -84,7 +84,7 @@ def view_of(cloud: Points, room: Points, eye: Float[np.ndarray, "3"]) -> Sight |
     )
 
 
-def margin(depth: Float[np.ndarray, "*_"]) -> Float[np.ndarray, "*_"]:
+def margin(depth: Float[np.ndarray, "*_"] | float) -> Float[np.ndarray, "*_"] | float:
     """How far in front of a seen point space is not yet taken as free, meters."""
     return MARGIN_M + MARGIN_PER_M2 * depth**2
 

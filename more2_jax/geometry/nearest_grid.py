@@ -12,7 +12,7 @@ from jax import Array
 from jaxtyping import Bool, Float, Int
 
 from more2_jax.geometry.points import FAR, nearest_index
-from more2_jax.types import pytree, quantity
+from more2_jax.types import AnyArray, pytree, quantity
 
 MARGIN = 0.1  # around the cloud, in shares of its longest edge; beyond, the nearest cell of the box answers
 
@@ -21,9 +21,11 @@ MARGIN = 0.1  # around the cloud, in shares of its longest edge; beyond, the nea
 class NearestGrid:
     """The table of one cloud; the cells of an axis are as many as of the others, so a thin box has thin cells."""
 
-    index: Int[Array, "*b g g g"] = quantity("invariant")  # into the cloud's rows
-    low: Float[Array, "*b 3"] = quantity("axis-aligned")  # corner of the box, in the cloud's frame and unit
-    cell: Float[Array, "*b 3"] = quantity("axis-aligned")  # its size
+    index: Int[AnyArray, "*b g g g"] = quantity("invariant")  # into the cloud's rows
+    low: Float[AnyArray, "*b 3"] = quantity(
+        "axis-aligned"
+    )  # corner of the box, in the cloud's frame and unit
+    cell: Float[AnyArray, "*b 3"] = quantity("axis-aligned")  # its size
 
 
 def nearest_grid(points: Float[Array, "n 3"], mask: Bool[Array, " n"], cells: int) -> NearestGrid:

@@ -19,7 +19,7 @@ from jaxtyping import Bool, Float, Int
 from more2_jax.config import MotionModel
 from more2_jax.geometry.nearest_grid import NearestGrid, look_up, nearest_grid
 from more2_jax.geometry.points import FAR, nearest_index, thin, transformed
-from more2_jax.types import Sampled, pytree, quantity
+from more2_jax.types import AnyArray, Sampled, pytree, quantity
 
 ALONG = 0.02  # weight of sliding along the surface, against leaving it
 DAMPING = 1e-4  # of the normal equations, in shares of their trace: a ball may turn freely
@@ -34,8 +34,8 @@ class Surface:
     """A cloud with normals, as a sample to compare and in full to be compared with. Normals have no side."""
 
     sampled: Sampled = quantity("record")
-    normals: Float[Array, "*b n 3"] = quantity("direction")  # of the sample
-    dense_normals: Float[Array, "*b m 3"] = quantity("direction")
+    normals: Float[AnyArray, "*b n 3"] = quantity("direction")  # of the sample
+    dense_normals: Float[AnyArray, "*b m 3"] = quantity("direction")
     grid: NearestGrid | None = quantity(
         "record", default=None
     )  # names the nearest of `dense`; without it every distance is measured

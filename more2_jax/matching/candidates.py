@@ -140,6 +140,7 @@ def evidence_at(
         best = np.argmin(cost + height_penalty(lift, radius, search), axis=1)
     at = np.arange(len(best)), best
     return PairEvidence(
+        pose=best,
         of_source=np.asarray(found.of_source)[at],
         of_target=np.asarray(found.of_target)[at],
         lift_m=lift[at],

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from more2_jax.config import MotionModel, SurfaceSearch
 from more2_jax.geometry.transform import rescale
@@ -31,6 +31,7 @@ PAIRS_A_CALL = 16
 class PairEvidence:
     """What aligning p pairs says of each, at the pose that fits best; host arrays."""
 
+    pose: Int[np.ndarray, " p"]  # which of the poses found that is
     of_source: Float[
         np.ndarray, " p"
     ]  # mean truncated distance of the source's points, shares of the truncation,

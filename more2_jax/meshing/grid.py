@@ -86,7 +86,7 @@ def upsampled(x: Grid) -> Grid:
     return x
 
 
-def surface_cells(values: Grid, step: float) -> Mask:
+def surface_cells(values: Grid, step: float) -> Bool[np.ndarray, "i-1 j-1 k-1"]:
     """Cells whose corners differ in sign, or are nearer to the surface than the cell's diagonal: a thin leg may
     pass between corners. One ring of cells more, since the field is only nearly a distance."""
     i, j, k = (n - 1 for n in values.shape)

@@ -25,7 +25,7 @@ from more2_jax.registration.pose_costs import (
     misfits_both_ways,
 )
 from more2_jax.registration.starting_poses import candidate_poses, masked_mean
-from more2_jax.types import Embedding, LocalBatch, Sight, pytree, quantity
+from more2_jax.types import AnyArray, Embedding, LocalBatch, Sight, pytree, quantity
 
 OBJECTS_A_CALL = 8  # prepared together: of few shapes, so that scenes share compiled programs
 PAIRS_A_CALL = 16  # searched together
@@ -37,7 +37,7 @@ class AlignableObject:
 
     whole: Surface = quantity("record")  # all of its points, with normals
     coarse: Surface = quantity("record")  # what a search compares
-    radius: Float[Array, "*b"] = quantity("length")
+    radius: Float[AnyArray, "*b"] = quantity("length")
     code: Embedding = quantity("record")
     sight: Sight | None = quantity("record", default=None)
 
@@ -47,9 +47,9 @@ class FoundPoses:
     """The poses of one pair that are worth refining, best first, and how well each fits."""
 
     poses: jaxlie.SE3 = quantity("pose")  # (*b, k): source's local frame to target's
-    cost: Float[Array, "*b k"] = quantity("invariant")  # by which they are ordered
-    of_source: Float[Array, "*b k"] = quantity("invariant")  # mean truncated distance of its points, and
-    of_target: Float[Array, "*b k"] = quantity("invariant")  # of the target's: 0 none, 1 nothing agrees
+    cost: Float[AnyArray, "*b k"] = quantity("invariant")  # by which they are ordered
+    of_source: Float[AnyArray, "*b k"] = quantity("invariant")  # mean truncated distance of its points, and
+    of_target: Float[AnyArray, "*b k"] = quantity("invariant")  # of the target's: 0 none, 1 nothing agrees
 
 
 def alignable(batch: LocalBatch, search: SurfaceSearch) -> AlignableObject:

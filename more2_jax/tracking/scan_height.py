@@ -16,6 +16,7 @@ from more2_jax.matching.candidates import (
     AlignedPairs,
     align_candidates,
     compared,
+    evidence_at,
     heights,
     odds_of,
     proposal_of,
@@ -98,7 +99,8 @@ def settled_height(aligned: AlignedPairs, matcher: EvidenceMatcher, height_m: fl
     if len(pairs) < 2:
         return first
     rows = [aligned.row_of(k, i) for k, i in pairs]
-    corrected_m = float(np.median(aligned.T_old_new[rows, 0, 2, 3]))
+    best = evidence_at(aligned, matcher.search, "upright", height_m).pose[rows]
+    corrected_m = float(np.median(aligned.T_old_new[rows, best, 2, 3]))
     if not LEAST_M < abs(corrected_m - height_m) < OUT_OF_REACH_M:
         return first
     again = weighed_at(aligned, matcher, corrected_m)

@@ -69,7 +69,7 @@ def test_a_copy_that_went_makes_the_other_interchangeable_and_far_motion_alone_r
 def test_log_odds_are_linear_and_the_two_ways_have_no_order():
     rng = np.random.default_rng(0)
     values = {k: rng.uniform(size=3) for k in FIELDS}
-    evidence = PairEvidence(radius_m=np.full(3, 0.5), off_own=np.zeros(3), **values)
+    evidence = PairEvidence(pose=np.zeros(3, int), radius_m=np.full(3, 0.5), off_own=np.zeros(3), **values)
     known = Compared(**{k: rng.uniform(size=3) for k in ("size", "likeness", "top_m", "color")})
     c = Calibration(
         intercept=1.0,
@@ -95,6 +95,7 @@ def test_log_odds_are_linear_and_the_two_ways_have_no_order():
 def test_the_prior_is_asked_in_any_orientation_alone_and_only_where_it_knows_the_clouds():
     rng = np.random.default_rng(0)
     evidence = PairEvidence(
+        pose=np.zeros(1, int),
         radius_m=np.full(3, 0.5),
         off_own=np.array([0.0, UNKNOWN, UNKNOWN + 0.1]),
         **{k: rng.uniform(size=3) for k in FIELDS},
