@@ -28,7 +28,7 @@ from more2_jax.geometry.point_to_plane import (
     spacing,
 )
 from more2_jax.geometry.points import nearest_index
-from more2_jax.types import AnyArray, pytree
+from more2_jax.types import AnyArray, pytree, quantity
 
 # The robust kernel narrows geometrically from the first width to the last, or to so many residuals of the points off
 # their own planes, whichever is more: a narrow kernel among noise hears the few points that happen to agree
@@ -45,10 +45,12 @@ NORMAL_SCALE = (
 class OrientedObservations:
     """What k scans saw of one object: points and outward unit normals in its frame, canonical units."""
 
-    points: Float[AnyArray, "*b k n 3"]
-    normals: Float[AnyArray, "*b k n 3"]
-    mask: Bool[AnyArray, "*b k n"]
-    residual: Float[AnyArray, "*b"]  # how far points lie off the planes of their neighbors, typically
+    points: Float[AnyArray, "*b k n 3"] = quantity("position")
+    normals: Float[AnyArray, "*b k n 3"] = quantity("direction")
+    mask: Bool[AnyArray, "*b k n"] = quantity("invariant")
+    residual: Float[AnyArray, "*b"] = quantity(
+        "length"
+    )  # how far points lie off the planes of their neighbors, typically
 
 
 @partial(jax.jit, static_argnums=(1, 2))
