@@ -90,8 +90,13 @@ def main(
     device_a_core(settings.training.batch, coordinator)
     connect(coordinator, processes, process)
     first = started_warm(settings.model, warm_start, name) if warm_start else None
-    most_bytes = resident_share * memory_bytes()
-    setting = prepared(settings, shards, out, deadline, name, first, most_bytes)
+    setting = prepared(settings, shards, out, deadline, name, first, resident_share * memory_bytes())
+    train_and_save(setting)
+
+
+def train_and_save(setting: Setting) -> None:
+    """Resumes where the newest checkpoint is, trains, and leaves checkpoint and weights."""
+    out = setting.out
     out.mkdir(parents=True, exist_ok=True)
     with open_checkpoints(out / "checkpoints") as manager:
         state = everywhere(setting.mesh, initial_state(setting.prior, setting.training))

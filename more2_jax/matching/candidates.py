@@ -76,18 +76,17 @@ def align_candidates(
     known = compared(old, new)
     among = proposed(proposal_of(known, matcher), matcher.candidates)
     rows = np.argwhere(among)[:, ::-1]
-    source, target = local_batch(new), local_batch(old)
-    ready = [alignable(side, matcher.search) for side in (source, target)]
-    pairs = paired_rows(source, target, rows, np.eye(4) if T_scene_scan is None else T_scene_scan)
+    sides = local_batch(new), local_batch(old)
+    ready = [alignable(side, matcher.search) for side in sides]
+    pairs = paired_rows(*sides, rows, np.eye(4) if T_scene_scan is None else T_scene_scan)
     instances, objects = (
-        jax.tree.map(lambda x, at=at: x[at], side) for side, at in zip(ready, rows.T, strict=True)
+        jax.tree.map(lambda x, at=at: x[at], s) for s, at in zip(ready, rows.T, strict=True)
     )
     found = search_poses(instances, objects, pairs.stayed, matcher.search, motion)
     off, own = np.zeros((*found.cost.shape, 2)), np.zeros(len(rows))
     if asks_prior(matcher.search, motion):
         found, off = off_completed_surfaces(prior, instances, objects, found, matcher.search)
         own = np.max([off_own_surface(prior, x)[at] for x, at in zip(ready, rows.T, strict=True)], axis=0)
-    (_, top), (_, other) = heights(old), heights(new)
     return AlignedPairs(
         among=among,
         pairs=pairs,
@@ -95,7 +94,7 @@ def align_candidates(
         found=found,
         T_old_new=pairs.to_world(found.poses),
         compared=Compared(**{k: v[among] for k, v in vars(known).items()}),
-        top_gap_m=(top[:, None] - other)[among],
+        top_gap_m=(heights(old)[1][:, None] - heights(new)[1])[among],
         off=off,
         off_own=own,
         height_m=0.0 if T_scene_scan is None else float(T_scene_scan[2, 3]),
