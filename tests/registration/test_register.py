@@ -199,7 +199,8 @@ def test_of_several_candidates_the_one_that_ends_with_the_lowest_residual_is_ret
     best = int(np.argmin([float(r.rms_m[0]) for r in alone]))
     assert best == 1
     for name in ("loss", "rms_m"):
-        np.testing.assert_allclose(getattr(together, name), getattr(alone[best], name), rtol=1e-3)
+        # The clouds are the same: what is left is rounding, far below a micrometer.
+        np.testing.assert_allclose(getattr(together, name), getattr(alone[best], name), rtol=1e-3, atol=1e-7)
     T, own = together.T_target_source, alone[best].T_target_source
     np.testing.assert_allclose(T.as_matrix(), own.as_matrix(), atol=1e-3)
 
