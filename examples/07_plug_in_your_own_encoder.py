@@ -53,7 +53,11 @@ def embed_all(scan: m2.Scan) -> tuple[m2.PointCloud, m2.Embedding]:
 old_scan, new_scan = (m2.read_scan(path) for path in demo_scan_paths()[:2])
 (old, old_codes), (new, new_codes) = embed_all(old_scan), embed_all(new_scan)
 config = m2.preset("robust", upright=True)
-partner = np.asarray(m2.match_instances(new_codes, old_codes, CodeMatcher(score="inv")).target_index)
+size = -np.abs(
+    np.log(new_codes.scale[:, None] / old_codes.scale)
+)  # evidence beside the codes: things keep theirs
+matches = m2.match_instances(new_codes, old_codes, CodeMatcher(score="inv"), bonus=size)
+partner = np.asarray(matches.target_index)
 
 truth = demo_ground_truth()
 pairs = [(n, o) for n, o in enumerate(partner) if o >= 0]
