@@ -66,15 +66,37 @@ def test_similarity_equivariance(prior):
     before, after = encode(prior, pad_clouds(clouds)), encode(prior, pad_clouds(moved))
     expected_eqv = turns @ np.asarray(before.eqv)
     expected_center = scales[:, None] * np.einsum("bij,bj->bi", turns, world_center(before)) + shifts
-    size = scales * np.asarray([np.ptp(x, axis=0).max() for x in clouds])
+    # Random weights put F_c tens of the object's lengths away from it: float32 holds it to shares of that distance.
+    size = np.asarray([np.ptp(x, axis=0).max() for x in clouds])
+    held = scales * np.maximum(size, np.linalg.norm(before.center, axis=1))
     largest = np.abs(before.inv).max(axis=1), np.abs(before.eqv).max(axis=(1, 2))
     deviations = {
         "inv": np.abs(after.inv - before.inv).max(axis=1) / largest[0],
         "eqv": np.abs(after.eqv - expected_eqv).max(axis=(1, 2)) / largest[1],
         "scale": np.abs(after.scale / (scales * before.scale) - 1),
-        "center": np.abs(world_center(after) - expected_center).max(axis=1) / size,
+        "center": np.abs(world_center(after) - expected_center).max(axis=1) / held,
     }
     assert max(d.max() for d in deviations.values()) <= 1e-4, deviations
+
+
+def test_similarity_equivariance_in_float64(tiny_prior):
+    """The law itself, without float32's rounding: all of it to a billionth of the object's size."""
+    scale, shift = 100.0, np.array([600.0, -800.0, 3.0])
+    turn = Rotation.random(random_state=1).as_matrix()
+    cloud = furniture(5, count=128)
+    with jax.enable_x64(True):
+        prior = jax.tree.map(lambda x: x.astype(jnp.float64), tiny_prior)
+        each = quick_jit(jax.vmap(lambda points: encode_one(prior, points, jnp.ones(128, bool))))
+        before, after = (
+            jax.tree.map(
+                lambda x, k=k: np.asarray(x[k]), each(np.stack([cloud, scale * cloud @ turn.T + shift]))
+            )
+            for k in range(2)
+        )
+    np.testing.assert_allclose(after.inv, before.inv, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(after.eqv, turn @ before.eqv, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(after.scale, scale * before.scale, rtol=1e-9)
+    np.testing.assert_allclose(after.center, scale * turn @ before.center + shift, rtol=0, atol=1e-9 * scale)
 
 
 def test_a_reflection_is_not_a_rotation(prior):
