@@ -222,6 +222,8 @@ class Instance:
     points: Float[np.ndarray, "n 3"]
     label: str | None = None
     colors: Integer[np.ndarray, "n 3"] | None = None  # uint8
+    # Unit, outward; 0 where a point's is not known. None: the scan says nothing.
+    normals: Float[np.ndarray, "n 3"] | None = None
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -42,6 +42,8 @@ class LabeledCloud:
     points: Float[np.ndarray, "n 3"]  # float64, in the file's unit
     instance: Integer[np.ndarray, "n"] | None  # 0 and negative: background; None: the file has no masks
     colors: Integer[np.ndarray, "n 3"] | None = None  # uint8
+    # Unit, out of the matter; 0 where a point's is not known. None: the file says nothing.
+    normals: Float[np.ndarray, "n 3"] | None = None
     point_labels: np.ndarray | None = None  # (n,) str or integer
     labels: dict[int, str] = field(default_factory=dict)  # instance → label, where the format says it once
     skipped: tuple[Skipped, ...] = ()

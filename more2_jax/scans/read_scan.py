@@ -12,6 +12,7 @@ from jaxtyping import Float, Integer
 from more2_jax.scans.formats.registry import FORMATS, WITH_DEPTH_FRAMES
 from more2_jax.scans.geometric_segmentation import SegmentationConfig, segment_geometric
 from more2_jax.scans.labeled_cloud import LabeledCloud, ReadOptions, one_line
+from more2_jax.scans.normal_sides import outward
 from more2_jax.scans.predicted_masks import lay_masks
 from more2_jax.types import Instance, Scan, Skipped
 
@@ -40,13 +41,16 @@ def read_scan(
 
     `path` is a PLY whose vertices carry an integer property naming the instance (`instance`, `instance_id`,
     `objectId`, `object_id` or `label`, in this order; `instance_property` names another), an NPZ with
-    `points` (n, 3), `instance` (n,) and optional `label` (n,), `color` or `colors` (n, 3), `sensors` (s, 3), a folder
-    of one PLY per object, or another of `data.formats.registry`. `<scan>.sensors.txt` beside it may say where its
-    sensors stood, x y z a line. Instance ids ≤ 0 are background. `unit` is the file's: m, cm or mm.
-    Instances of fewer than `min_points` points are reported in `Scan.skipped`; sizes that look like another
-    unit, in `Scan.warnings`. `masks` are predicted ones (`data.masks`): those scored `min_score` or more replace
-    the scan's own. `segment="geometric"` cuts a cloud without instances into planes and clusters; `depth_frames`
-    reads the raw depth of 3RScan, not its mesh (paper §4).
+    `points` (n, 3), `instance` (n,) and optional `label` (n,), `color` or `colors` (n, 3), `normal` or
+    `normals` (n, 3), `sensors` (s, 3), a folder of one PLY per object, or another of `data.formats.registry`.
+    `<scan>.sensors.txt` beside it may say where its sensors stood, x y z a line. Instance ids ≤ 0 are background.
+    `unit` is the file's: m, cm or mm. Instances of fewer than `min_points` points are reported in
+    `Scan.skipped`; sizes that look like another unit, in `Scan.warnings`. `masks` are predicted ones
+    (`data.masks`): those scored `min_score` or more replace the scan's own. `segment="geometric"` cuts a cloud
+    without instances into planes and clusters; `depth_frames` reads the raw depth of 3RScan, not its mesh
+    (paper §4).
+    Normals are the file's, else those of its faces by their winding; out of the matter, which
+    `normal_sides` sees to.
 
     Raises ValueError, in one line, when the file is missing, unknown, damaged, has no instance property, has
     coordinates that are not finite, or no instance is left.
@@ -134,7 +138,8 @@ def _scan(path: Path, cloud: LabeledCloud, unit: str, min_points: int) -> Scan:
     points = cloud.points * UNITS_M[unit]
     sensors = sensors_of(path, cloud)
     background = points[cloud.instance <= 0]
-    kept, skipped = _instances(cloud, cloud.instance, points, min_points)
+    normals, turned = _outward_normals(cloud, cloud.instance, sensors)
+    kept, skipped = _instances(replace(cloud, normals=normals), cloud.instance, points, min_points)
     if not kept:
         raise ValueError(f"{path}: no instances left; {_why_none(len(background), skipped, min_points)}")
     return Scan(
@@ -144,8 +149,19 @@ def _scan(path: Path, cloud: LabeledCloud, unit: str, min_points: int) -> Scan:
         background=background,
         sensors=sensors * UNITS_M[unit],
         skipped=(*cloud.skipped, *skipped),
-        warnings=(*cloud.warnings, *_unit_warnings(kept, unit)),
+        warnings=(*cloud.warnings, *turned, *_unit_warnings(kept, unit)),
     )
+
+
+def _outward_normals(
+    cloud: LabeledCloud, instance: Integer[np.ndarray, " n"], sensors: Float[np.ndarray, "s 3"]
+) -> tuple[Float[np.ndarray, "n 3"] | None, tuple[str, ...]]:
+    """The cloud's normals, out of the matter, and a warning where they had to be turned."""
+    if cloud.normals is None:
+        return None, ()
+    normals, turned = outward(cloud.points, cloud.normals, instance, sensors)
+    said = ("normals point into the surfaces, away from the room; they are turned around",) if turned else ()
+    return normals, said
 
 
 def sensors_of(path: Path, cloud: LabeledCloud) -> Float[np.ndarray, "s 3"]:
@@ -187,7 +203,9 @@ def _instances(
             skipped.append(Skipped(what=f"instance {index}", reason=reason))
             continue
         colors = None if cloud.colors is None else cloud.colors[rows]
-        kept.append(Instance(id=index, points=points[rows], label=_label(cloud, index, rows), colors=colors))
+        normals = None if cloud.normals is None else cloud.normals[rows]
+        label = _label(cloud, index, rows)
+        kept.append(Instance(id=index, points=points[rows], label=label, colors=colors, normals=normals))
     return tuple(kept), tuple(skipped)
 
 

@@ -134,6 +134,7 @@ def labeled_by_groups(
         points=cloud.points,
         instance=instance,
         colors=cloud.colors,
+        normals=cloud.normals,
         labels=labels,
         skipped=(*structural, *empty),
         unit="m",

@@ -10,11 +10,12 @@ import numpy as np
 from jaxtyping import Float, Integer
 from plyfile import PlyData, PlyParseError
 
+from more2_jax.scans.files.ply_faces import CORNERS, face_corners, unit_or_zero, vertex_normals
 from more2_jax.scans.labeled_cloud import one_line
 
 INSTANCE_PROPERTIES = ("instance", "instance_id", "objectId", "object_id", "label")
 COLOR_PROPERTIES = ("red", "green", "blue")
-CORNERS = ("vertex_indices", "vertex_index")
+NORMAL_PROPERTIES = ("nx", "ny", "nz")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -23,6 +24,9 @@ class PlyCloud:
 
     points: Float[np.ndarray, "n 3"]  # float64
     properties: dict[str, np.ndarray]  # name → (n,)
+    normals: Float[np.ndarray, "n 3"] | None = (
+        None  # unit, outward; 0: not known. None: the file says nothing
+    )
 
     @property
     def integer_properties(self) -> list[str]:
@@ -62,7 +66,22 @@ def cloud_of(path: Path, elements: PlyData) -> PlyCloud:
         raise ValueError(f"{path}: {', '.join(missing)} of the vertices are lists; needed numbers")
     with np.errstate(invalid="ignore"):  # a signaling NaN: refused where coordinates are checked
         points = np.stack([scalars.pop(axis).astype(np.float64) for axis in "xyz"], axis=-1)
-    return PlyCloud(points=points, properties=scalars)
+    return PlyCloud(points=points, properties=scalars, normals=_normals(path, elements, points, scalars))
+
+
+def _normals(
+    path: Path, elements: PlyData, points: Float[np.ndarray, "n 3"], scalars: dict[str, np.ndarray]
+) -> Float[np.ndarray, "n 3"] | None:
+    """The vertices' own where the file has them, else those of its faces; damaged faces have nothing to say."""
+    if all(n in scalars for n in NORMAL_PROPERTIES):
+        return unit_or_zero(np.stack([scalars[n] for n in NORMAL_PROPERTIES], axis=-1))
+    if "face" not in elements or not np.isfinite(points).all():
+        return None
+    try:
+        corners, face = face_corners(path, elements, len(points))
+    except ValueError:
+        return None
+    return vertex_normals(points, corners, face) if len(corners) else None
 
 
 def read_elements(path: Path) -> PlyData:

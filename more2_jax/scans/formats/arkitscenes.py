@@ -51,7 +51,9 @@ def read(path: Path, options: ReadOptions) -> LabeledCloud:
     cloud = read_ply(mesh)
     annotation = mesh.with_name(mesh.name.removesuffix(MESH) + BOXES)
     if options.masks or not (options.masks_needed or annotation.is_file()):
-        return LabeledCloud(points=cloud.points, instance=None, colors=cloud.colors, unit="m")
+        return LabeledCloud(
+            points=cloud.points, instance=None, colors=cloud.colors, normals=cloud.normals, unit="m"
+        )
     if not annotation.is_file():
         raise ValueError(f"{mesh}: no {annotation.name} beside it; needed its boxes, or masks of your own")
     boxes = read_boxes(annotation)
@@ -60,6 +62,7 @@ def read(path: Path, options: ReadOptions) -> LabeledCloud:
         points=cloud.points,
         instance=instance,
         colors=cloud.colors,
+        normals=cloud.normals,
         labels={i: box.label for i, box in enumerate(boxes, 1) if box.label},
         skipped=skipped,
         unit="m",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +10,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
+from more2_jax.scans.files.ply_faces import unit_or_zero
 from more2_jax.scans.labeled_cloud import LabeledCloud, ReadOptions, one_line
 from more2_jax.types import Skipped
 
@@ -16,7 +18,20 @@ CHUNK = 1_000_000  # points read at once: a header that lies about their number 
 CARTESIAN = ("cartesianX", "cartesianY", "cartesianZ")
 SPHERICAL = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
 COLORS = ("colorRed", "colorGreen", "colorBlue")
+NORMALS = ("nor:normalX", "nor:normalY", "nor:normalZ")  # of the extension for surface normals
 INVALID = ("cartesianInvalidState", "sphericalInvalidState")
+
+
+@dataclass(frozen=True, kw_only=True)
+class StationScan:
+    """One of the file's scans, in the file's frame."""
+
+    points: Float[np.ndarray, "n 3"]
+    colors: np.ndarray | None
+    normals: Float[np.ndarray, "n 3"] | None
+    invalid: int  # points left out, for they are marked so
+    # Where the scanner stood: at the zero of its own points, which is known where the scan has a pose.
+    place: Float[np.ndarray, "3"] | None
 
 
 def recognizes(path: Path) -> bool:
@@ -38,26 +53,28 @@ def read(path: Path, options: ReadOptions) -> LabeledCloud:
             image.close()
     except Exception as error:
         raise ValueError(f"{path}: truncated or damaged E57 ({one_line(error)})") from error
-    colors = [color for _, color, _, _ in scans if color is not None]
     return LabeledCloud(
-        points=np.concatenate([np.zeros((0, 3)), *(points for points, *_ in scans)]),
+        points=np.concatenate([np.zeros((0, 3)), *(s.points for s in scans)]),
         instance=None,
-        colors=np.concatenate(colors) if scans and len(colors) == len(scans) else None,
+        colors=_of_all([s.colors for s in scans]),
+        normals=_of_all([s.normals for s in scans]),
         skipped=tuple(
-            Skipped(what=f"{dropped} points of scan {i}", reason="marked as invalid")
-            for i, (_, _, dropped, _) in enumerate(scans)
-            if dropped
+            Skipped(what=f"{s.invalid} points of scan {i}", reason="marked as invalid")
+            for i, s in enumerate(scans)
+            if s.invalid
         ),
         unit="m",
-        sensors=np.array([place for *_, place in scans if place is not None]).reshape(-1, 3),
+        sensors=np.array([s.place for s in scans if s.place is not None]).reshape(-1, 3),
     )
 
 
-def _scan(libe57: Any, image: Any, node: Any) -> tuple[np.ndarray, np.ndarray | None, int, np.ndarray | None]:
-    """Points in the file's frame, colors, how many points were marked as invalid, and where the scanner stood.
+def _of_all(parts: list[np.ndarray | None]) -> np.ndarray | None:
+    """End to end where every scan has it, else None."""
+    known = [p for p in parts if p is not None]
+    return np.concatenate(known) if parts and len(known) == len(parts) else None
 
-    That is known where the scan has a pose: a scanner stands at the zero of its own points.
-    """
+
+def _scan(libe57: Any, image: Any, node: Any) -> StationScan:
     compressed = node["points"]
     prototype = libe57.StructureNode(compressed.prototype())
     has = {prototype.get(i).elementName() for i in range(prototype.childCount())}
@@ -67,7 +84,8 @@ def _scan(libe57: Any, image: Any, node: Any) -> tuple[np.ndarray, np.ndarray | 
             f"a scan has {', '.join(sorted(has))}; needed {', '.join(CARTESIAN)} or {', '.join(axes)}"
         )
     invalid = INVALID[axes is SPHERICAL]
-    names = [*axes, *(c for c in COLORS if has.issuperset(COLORS)), *({invalid} & has)]
+    names = [*axes, *({invalid} & has)]
+    names += [n for group in (COLORS, NORMALS) if has.issuperset(group) for n in group]
     columns = _columns(libe57, image, compressed, names)
     good = columns[invalid] == 0 if invalid in columns else np.ones(len(columns[axes[0]]), bool)
     points = np.stack([columns[axis][good] for axis in axes], axis=-1)
@@ -77,8 +95,16 @@ def _scan(libe57: Any, image: Any, node: Any) -> tuple[np.ndarray, np.ndarray | 
     if COLORS[0] in columns:
         rgb = np.stack([columns[c][good] for c in COLORS], axis=-1)
         colors = _eight_bits(rgb, *_color_limits(node, prototype))
-    place = _posed(node, np.zeros((1, 3)))[0] if node.isDefined("pose") else None
-    return _posed(node, points), colors, int((~good).sum()), place
+    zero, normals = _posed(node, np.zeros((1, 3))), None
+    if NORMALS[0] in columns:
+        normals = unit_or_zero(_posed(node, np.stack([columns[n][good] for n in NORMALS], axis=-1)) - zero)
+    return StationScan(
+        points=_posed(node, points),
+        colors=colors,
+        normals=normals,
+        invalid=int((~good).sum()),
+        place=zero[0] if node.isDefined("pose") else None,
+    )
 
 
 def _columns(libe57: Any, image: Any, compressed: Any, names: list[str]) -> dict[str, np.ndarray]:

@@ -1,4 +1,4 @@
-"""An NPZ with `points` (n, 3), `instance` (n,) and optional `label`, `color` (or `colors`), and where sensors stood."""
+"""An NPZ with `points` (n, 3), `instance` (n,) and optional `label`, `color`, `normal`, and where sensors stood."""
 
 from __future__ import annotations
 
@@ -7,9 +7,11 @@ from pathlib import Path
 import numpy as np
 
 from more2_jax.scans.files.npz import read_arrays
+from more2_jax.scans.files.ply_faces import unit_or_zero
 from more2_jax.scans.labeled_cloud import LabeledCloud, ReadOptions, instance_ids
 
 COLORS = ("color", "colors")  # the first that is there
+NORMALS = ("normal", "normals")  # the first that is there
 SENSORS, CAMERAS = "sensors", "T_scan_camera"  # places (s, 3), or poses (s, 4, 4) of cameras in the scan
 HOW = " (name the instances with --instance-property, or cut the scan with --segment geometric)"
 
@@ -21,7 +23,7 @@ def recognizes(path: Path) -> bool:
 
 def read(path: Path, options: ReadOptions) -> LabeledCloud:
     key = options.instance_property or "instance"
-    arrays, names = read_arrays(path, ("points", key, "label", *COLORS, SENSORS, CAMERAS))
+    arrays, names = read_arrays(path, ("points", key, "label", *COLORS, *NORMALS, SENSORS, CAMERAS))
     segmented = not options.masks_needed and options.instance_property is None
     if missing := [k for k in ("points", *((key,) if not segmented else ())) if k not in arrays]:
         raise ValueError(f"{path}: arrays are {names}; needed {' and '.join(missing)} too" + HOW)
@@ -31,6 +33,7 @@ def read(path: Path, options: ReadOptions) -> LabeledCloud:
         points=arrays["points"].astype(np.float64),
         instance=instance_ids(path, arrays[key]) if key in arrays else None,
         colors=_colors(next((arrays[k] for k in COLORS if k in arrays), None)),
+        normals=next((unit_or_zero(arrays[k]) for k in NORMALS if k in arrays), None),
         point_labels=labels,
         sensors=_sensors(arrays),
     )
@@ -39,7 +42,7 @@ def read(path: Path, options: ReadOptions) -> LabeledCloud:
 def _check_npz(path: Path, arrays: dict[str, np.ndarray], key: str) -> None:
     points, count = arrays["points"], len(np.atleast_1d(arrays["points"]))
     needed = {"points": ((count, 3), "iuf"), key: ((count,), "iu")}
-    needed |= dict.fromkeys(COLORS, ((count, 3), "iuf"))
+    needed |= dict.fromkeys((*COLORS, *NORMALS), ((count, 3), "iuf"))
     needed |= {"label": ((count,), "iuUS")} if key != "label" else {}
     for name, each in ((SENSORS, (3,)), (CAMERAS, (4, 4))):
         needed[name] = ((len(np.atleast_1d(arrays.get(name, ()))), *each), "iuf")

@@ -12,12 +12,14 @@ import numpy as np
 from jaxtyping import Integer
 
 from more2_jax.scans.files.ply_cloud import INSTANCE_PROPERTIES
+from more2_jax.scans.files.ply_faces import unit_or_zero
 from more2_jax.scans.labeled_cloud import LabeledCloud, ReadOptions
 
 LONGEST_HEADER = 65_536  # bytes
 LONGEST_REFERENCE = 264  # bytes that three bytes of LZF, a reference back, can yield
 LARGEST_EXACT = 2**53  # whole numbers that a text's float64 holds exactly
 COLORS = ("rgb", "rgba")
+NORMALS = ("normal_x", "normal_y", "normal_z")
 KINDS = {"F": "f", "I": "i", "U": "u"}
 SIZES = {"F": (4, 8), "I": (1, 2, 4, 8), "U": (1, 2, 4, 8)}
 IDENTITY = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
@@ -70,10 +72,17 @@ def read(path: Path, options: ReadOptions) -> LabeledCloud:
         points=points[valid],
         instance=None if name is None else _whole(path, columns[name])[valid],
         colors=None if colors is None else colors[valid],
+        normals=_normals(columns, np.asarray(valid)),
         point_labels=labels[valid] if labels is not None and labels.dtype.kind in "iu" else None,
         warnings=_warnings(header, int((~valid).sum())),
         rows=np.asarray(valid),
     )
+
+
+def _normals(columns: dict[str, np.ndarray], valid: np.ndarray) -> np.ndarray | None:
+    if not all(n in columns for n in NORMALS):
+        return None
+    return unit_or_zero(np.stack([columns[n] for n in NORMALS], axis=-1)[valid])
 
 
 def _warnings(header: Header, dropped: int) -> tuple[str, ...]:

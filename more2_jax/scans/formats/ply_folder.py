@@ -23,10 +23,12 @@ def read(path: Path, options: ReadOptions) -> LabeledCloud:
     clouds = [read_ply(file) for file in files]
     ids = _folder_ids([file.stem for file in files])
     colors = [cloud.colors for cloud in clouds if cloud.colors is not None]
+    normals = [cloud.normals for cloud in clouds if cloud.normals is not None]
     return LabeledCloud(
         points=np.concatenate([cloud.points for cloud in clouds]),
         instance=np.repeat(np.array(ids, np.int64), [len(cloud.points) for cloud in clouds]),
         colors=np.concatenate(colors) if len(colors) == len(clouds) else None,
+        normals=np.concatenate(normals) if len(normals) == len(clouds) else None,
         labels={i: file.stem for i, file in zip(ids, files, strict=True)},
         skipped=tuple(
             Skipped(what=file.name, reason="no points")

@@ -34,7 +34,8 @@ def read(path: Path, options: ReadOptions) -> LabeledCloud:
     file = next(file for file in _candidates(path) if file.is_file())
     mesh = read_ply_mesh(file)
     if options.masks or not (options.masks_needed or file.with_name(CLASSES).is_file()):
-        return LabeledCloud(points=mesh.cloud.points, instance=None, colors=mesh.cloud.colors, unit="m")
+        c = mesh.cloud
+        return LabeledCloud(points=c.points, instance=None, colors=c.colors, normals=c.normals, unit="m")
     objects = mesh.face_properties.get(OBJECT)
     if objects is None or objects.dtype.kind not in "iu":
         raise ValueError(f"{file}: faces have no whole number {OBJECT}; needed the object of every face")
@@ -47,11 +48,12 @@ def read(path: Path, options: ReadOptions) -> LabeledCloud:
     labels = {i + shift: name for i, name in classes.items()}
     empty = sorted(set(labels) - set(np.unique(instance).tolist()))
     instance, structural = drop_background(instance, labels)
-    colors = mesh.cloud.colors
+    colors, normals = mesh.cloud.colors, mesh.cloud.normals
     return LabeledCloud(
         points=mesh.cloud.points[vertex],
         instance=instance,
         colors=None if colors is None else colors[vertex],
+        normals=None if normals is None else normals[vertex],
         labels=labels,
         skipped=(
             *structural,

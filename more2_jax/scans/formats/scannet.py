@@ -36,7 +36,9 @@ def read(path: Path, options: ReadOptions) -> LabeledCloud:
         return ply_scan.read(mesh, options)
     cloud = read_ply(mesh)
     if options.masks or not (options.masks_needed or _annotated(mesh)):
-        return LabeledCloud(points=cloud.points, instance=None, colors=cloud.colors, unit="m")
+        return LabeledCloud(
+            points=cloud.points, instance=None, colors=cloud.colors, normals=cloud.normals, unit="m"
+        )
     groups = read_groups(_beside(mesh, *AGGREGATIONS))
     if any(group.id < 0 for group in groups):
         raise ValueError(f"{_beside(mesh, *AGGREGATIONS)}: a negative objectId; needed 0 or more")

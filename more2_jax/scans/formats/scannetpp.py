@@ -28,7 +28,9 @@ def read(path: Path, options: ReadOptions) -> LabeledCloud:
     mesh = next(file for file in _candidates(path) if file.is_file())
     cloud = read_ply(mesh)
     if options.masks or not (options.masks_needed or mesh.with_name(ANNOTATION).is_file()):
-        return LabeledCloud(points=cloud.points, instance=None, colors=cloud.colors, unit="m")
+        return LabeledCloud(
+            points=cloud.points, instance=None, colors=cloud.colors, normals=cloud.normals, unit="m"
+        )
     for name in (SEGMENTS, ANNOTATION):
         if not mesh.with_name(name).is_file():
             raise ValueError(f"{mesh}: no {name} beside it; needed the annotation, or masks of your own")

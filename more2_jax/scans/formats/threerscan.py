@@ -64,14 +64,15 @@ def read(path: Path, options: ReadOptions) -> LabeledCloud:
     instance = _instances(annotated, cloud)
     labels, empty, remarks = _labels(folder, instance)
     instance, structural = drop_background(instance, labels)
-    points, skipped, sensors = cloud.points, (*structural, *empty), None
+    points, normals, skipped, sensors = cloud.points, cloud.normals, (*structural, *empty), None
     if options.depth_frames:
         found, sensors, lost = depth_points(open_sequence(folder))
         instance = nearest_instance(cloud.points, instance, found)
-        points, skipped = found, (*skipped, *lost)
+        points, normals, skipped = found, None, (*skipped, *lost)
     return LabeledCloud(
         points=points,
         instance=None if options.masks else instance,
+        normals=normals,
         labels=labels,
         skipped=skipped,
         unit="m",
