@@ -121,16 +121,27 @@ def fuse(
     return decimated(without_crumbs(volume.mesh()), kept_faces)
 
 
+def without_bow_ties(faces: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, "g 3"]:
+    """The faces less those at vertices where two borders meet, which no edge collapse can handle."""
+    while True:
+        edges, count = np.unique(np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)), axis=0, return_counts=True)
+        borders = np.bincount(edges[count == 1].ravel(), minlength=int(faces.max(initial=0)) + 1)
+        bad = (borders > 2)[faces].any(axis=1)
+        if not bad.any():
+            return faces
+        faces = faces[~bad]
+
+
 def without_crumbs(mesh: ColoredMesh) -> ColoredMesh:
-    """The mesh without pieces of fewer than `SMALLEST_PIECE` vertices."""
-    count = len(mesh.vertices)
-    edges = mesh.faces[:, [0, 1, 1, 2]].reshape(-1, 2)
+    """The mesh without pieces of fewer than `SMALLEST_PIECE` vertices, and without bow ties."""
+    count, faces = len(mesh.vertices), without_bow_ties(mesh.faces)
+    edges = faces[:, [0, 1, 1, 2]].reshape(-1, 2)
     links = coo_matrix((np.ones(len(edges)), edges.T), shape=(count, count))
     piece = connected_components(links, directed=False)[1]
     kept = np.bincount(piece)[piece] >= SMALLEST_PIECE
     number = np.cumsum(kept) - 1
     return ColoredMesh(
-        vertices=mesh.vertices[kept], faces=number[mesh.faces[kept[mesh.faces[:, 0]]]], colors=mesh.colors[kept]
+        vertices=mesh.vertices[kept], faces=number[faces[kept[faces[:, 0]]]], colors=mesh.colors[kept]
     )
 
 

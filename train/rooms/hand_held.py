@@ -80,7 +80,7 @@ def walk(
     eye = _clear(eye + [0, 0, 1] * rng.normal(0, 0.02, (frames, 1)), taken)
     target = seen[first] * (1 - smooth) + seen[first + 1] * smooth
     poses = np.stack([camera_matrix(looking(e, t)) for e, t in zip(eye, target, strict=True)])
-    roll = Rotation.from_euler("z", rng.normal(0, 4, frames), degrees=True).as_matrix()
+    roll = Rotation.from_rotvec([0, 0, 4] * rng.normal(size=(frames, 1)), degrees=True).as_matrix()
     poses[:, :3, :3] = poses[:, :3, :3] @ roll
     return np.round(poses, 9) if blind is None else _turned_away(np.round(poses, 9), blind)
 

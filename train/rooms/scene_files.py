@@ -34,22 +34,36 @@ def write_scene(folder: Path, scene: FlyingScene, facts: Mapping[str, Any], rng:
 
     `facts` (seed, settings) go into scene.json as they are. `rng` thins dense scans.
     """
-    partial = folder.with_name(f"{folder.name}.partial")
-    shutil.rmtree(partial, ignore_errors=True)
-    (partial / "meshes").mkdir(parents=True)
-    digest = hashlib.sha256()
-    files = {}
-    for o in scene.objects:
-        files.setdefault(o.model, f"meshes/{file_name(o.model)}.ply")
-    for model, file in files.items():
-        mesh = next(o for o in scene.objects if o.model == model)
-        write_mesh(partial / file, Mesh(vertices=mesh.vertices, faces=mesh.faces.astype(np.int32)))
-        _feed(digest, {"vertices": mesh.vertices, "faces": mesh.faces.astype(np.int32)})
+    partial, digest = started(folder), hashlib.sha256()
+    files = write_meshes(partial, scene.objects, digest)
     for index in range(len(scene.scans)):
         arrays = scan_arrays(scene, index, rng)
         np.savez_compressed(partial / f"scan_{index}.npz", **arrays)  # pyright: ignore[reportArgumentType]
-        _feed(digest, arrays)
-    truth = scene_truth(scene, facts, files)
+        feed(digest, arrays)
+    return finished(partial, folder, scene_truth(scene, facts, files), digest)
+
+
+def started(folder: Path) -> Path:
+    """An empty folder beside, to be filled and then renamed by `finished`."""
+    partial = folder.with_name(f"{folder.name}.partial")
+    shutil.rmtree(partial, ignore_errors=True)
+    (partial / "meshes").mkdir(parents=True)
+    return partial
+
+
+def write_meshes(partial: Path, objects: Sequence[TrueObject], digest: Digest) -> dict[str, str]:
+    """Writes each model once; the file of each."""
+    files: dict[str, str] = {}
+    for o in objects:
+        if o.model not in files:
+            files[o.model] = f"meshes/{file_name(o.model)}.ply"
+            write_mesh(partial / files[o.model], Mesh(vertices=o.vertices, faces=o.faces.astype(np.int32)))
+            feed(digest, {"vertices": o.vertices, "faces": o.faces.astype(np.int32)})
+    return files
+
+
+def finished(partial: Path, folder: Path, truth: dict[str, Any], digest: Digest) -> str:
+    """Writes scene.json last, renames the folder, and returns the digest of it all."""
     digest.update(json.dumps(truth, sort_keys=True).encode())
     truth["digest"] = digest.hexdigest()
     (partial / "scene.json").write_text(json.dumps(truth, indent=1), encoding="utf-8")
