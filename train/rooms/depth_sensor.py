@@ -30,7 +30,10 @@ class DepthSensor:
     noise_per_m2: float = 0.0019  # added per (depth − 0.4 m)²
     disparity_step: float = 0.0029  # 1 / m: depth comes in steps of this times its square
     edge_m: float = 0.04  # neighbors further apart in depth, per meter of depth, make an edge
-    edge_loss: float = 0.7  # share of the pixels at an edge that are lost
+    edge_loss: tuple[float, float] = (
+        0.25,
+        0.8,
+    )  # share of the pixels at an edge that are lost, near and far side
     dropout: float = 0.01
     grazing_deg: float = 80.0  # rays steeper than this against the surface return nothing
 
@@ -88,7 +91,9 @@ class FrameCaster:
         grazing = cosine < np.cos(np.deg2rad(self.sensor.grazing_deg))
         measured = measure(depth, self.sensor, rng)
         measured[grazing] = 0.0
-        return Frame(T_room_camera=T_room_camera, depth=depth, face=np.where(hit, face, -1), measured=measured)
+        return Frame(
+            T_room_camera=T_room_camera, depth=depth, face=np.where(hit, face, -1), measured=measured
+        )
 
 
 def measure(
@@ -102,7 +107,7 @@ def measure(
     noisy = z + noise * noise_std(z, sensor)
     steps = np.round(1 / np.maximum(noisy, 0.05) / sensor.disparity_step)
     quantized = 1 / np.maximum(steps * sensor.disparity_step, 1e-6)
-    lost = (kept < sensor.dropout) | (at_edges(z, sensor) & (edge_kept < sensor.edge_loss))
+    lost = (kept < sensor.dropout) | (edge_kept < at_edges(z, sensor))
     lost |= ~known | (quantized < sensor.nearest_m) | (quantized > sensor.farthest_m)
     return np.where(lost, 0.0, quantized)
 
@@ -112,15 +117,16 @@ def noise_std(depth: Float[np.ndarray, " p"], sensor: DepthSensor) -> Float[np.n
     return sensor.noise_m + sensor.noise_per_m2 * (depth - 0.4) ** 2
 
 
-def at_edges(depth: Float[np.ndarray, " p"], sensor: DepthSensor) -> Bool[np.ndarray, " p"]:
-    """Pixels one of whose four neighbors lies much nearer or farther."""
+def at_edges(depth: Float[np.ndarray, " p"], sensor: DepthSensor) -> Float[np.ndarray, " p"]:
+    """The chance that a pixel is lost because one of its four neighbors lies much nearer or farther."""
     image = depth.reshape(sensor.height, sensor.width)
-    edge = np.zeros(image.shape, bool)
+    chance = np.zeros(image.shape)
     for axis in (0, 1):
-        near = np.minimum(np.take(image, range(image.shape[axis] - 1), axis), np.take(image, range(1, image.shape[axis]), axis))
-        jump = np.abs(np.diff(image, axis=axis)) > sensor.edge_m * near + 0.02
-        pad = [(0, 0), (0, 0)]
-        for side in ((0, 1), (1, 0)):
+        one, other = (np.delete(image, k, axis) for k in (-1, 0))
+        jump = np.abs(one - other) > sensor.edge_m * np.minimum(one, other) + 0.02
+        for closer, side in ((one < other, (0, 1)), (other < one, (1, 0))):
+            near, far = (jump * loss for loss in sensor.edge_loss)
+            pad = [(0, 0), (0, 0)]
             pad[axis] = side
-            edge |= np.pad(jump, pad)
-    return edge.ravel()
+            chance = np.maximum(chance, np.pad(np.where(closer, near, far), pad))
+    return chance.ravel()

@@ -123,9 +123,12 @@ def fuse(
 
 def without_bow_ties(faces: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, "g 3"]:
     """The faces less those at vertices where two borders meet, which no edge collapse can handle."""
+    size = int(faces.max(initial=0)) + 1
     while True:
-        edges, count = np.unique(np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)), axis=0, return_counts=True)
-        borders = np.bincount(edges[count == 1].ravel(), minlength=int(faces.max(initial=0)) + 1)
+        pairs = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+        edges, count = np.unique(pairs[:, 0] * size + pairs[:, 1], return_counts=True)
+        ends = np.stack(np.divmod(edges[count == 1], size))
+        borders = np.bincount(ends.ravel(), minlength=size)
         bad = (borders > 2)[faces].any(axis=1)
         if not bad.any():
             return faces

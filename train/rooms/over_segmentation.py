@@ -16,8 +16,8 @@ def over_segmentation(
     vertices: Float[np.ndarray, "v 3"], normals: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]
 ) -> Int[np.ndarray, " v"]:
     """The piece of every vertex, from 0. Edges join pieces in order of how much normals turn along them."""
-    edges = np.unique(np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0)
-    a, b = edges.T
+    pairs = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    a, b = np.divmod(np.unique(pairs[:, 0] * len(vertices) + pairs[:, 1]), len(vertices))
     turn = 1 - (normals[a] * normals[b]).sum(axis=1)
     convex = ((vertices[b] - vertices[a]) * normals[b]).sum(axis=1) > 0
     weight = np.where(convex, turn**2, turn)  # a convex edge rarely parts two objects

@@ -90,7 +90,9 @@ def _on_walls(room_m: tuple[float, float], rng: np.random.Generator) -> list[Sha
         reach = room_m[1 - side % 2] / 2 - width / 2
         along, low = float(rng.uniform(-reach, reach)), float(rng.choice([0.15, 1.2, 1.4]))
         deep, high = float(rng.uniform(0.02, 0.08)), low + float(rng.uniform(0.3, 0.7))
-        shapes.append(box(*_against(room_m, side, along, width, deep, (low, high)), rng.uniform(0.1, 0.95, 3)))
+        shapes.append(
+            box(*_against(room_m, side, along, width, deep, (low, high)), rng.uniform(0.1, 0.95, 3))
+        )
     return shapes
 
 
