@@ -90,11 +90,11 @@ class Volume:
     def mesh(self) -> ColoredMesh:
         """The zero surface where every corner of a cell was seen. ValueError if there is none."""
         known = (self.weight >= LEAST_WEIGHT).reshape(self.shape)
-        whole = np.zeros(self.shape, bool)
-        whole[:-1, :-1, :-1] = True
+        whole = np.zeros(self.shape, bool)  # marching cubes asks at a cell's farthest corner
+        whole[1:, 1:, 1:] = True
         for corner in np.ndindex(2, 2, 2):
             part = tuple(slice(c, n - 1 + c) for c, n in zip(corner, self.shape, strict=True))
-            whole[:-1, :-1, :-1] &= known[part]
+            whole[1:, 1:, 1:] &= known[part]
         volume = self.distance.reshape(self.shape)
         vertices, faces, _, _ = marching_cubes(volume, 0.0, mask=whole, gradient_direction="ascent")
         cell = np.clip(np.round(vertices).astype(np.int64), 0, np.array(self.shape) - 1)

@@ -77,7 +77,7 @@ def walk(
     smooth = (share * share * (3 - 2 * share))[:, None]
     eyes, seen = (np.stack(part) for part in zip(*stops, strict=True))
     eye = eyes[first] * (1 - share[:, None]) + eyes[first + 1] * share[:, None]
-    eye = _clear(eye + [0, 0, 1] * rng.normal(0, 0.02, (frames, 1)), taken)
+    eye = _clear(eye + [0, 0, 1] * rng.normal(0, 0.02, (frames, 1)), taken, room_m)
     target = seen[first] * (1 - smooth) + seen[first + 1] * smooth
     poses = np.stack([camera_matrix(looking(e, t)) for e, t in zip(eye, target, strict=True)])
     roll = Rotation.from_rotvec([0, 0, 4] * rng.normal(size=(frames, 1)), degrees=True).as_matrix()
@@ -129,14 +129,18 @@ def _standing(
     )
 
 
-def _clear(eye: Float[np.ndarray, "f 3"], taken: Sequence[Circle]) -> Float[np.ndarray, "f 3"]:
-    """The path led around what is `taken`."""
+def _clear(
+    eye: Float[np.ndarray, "f 3"], taken: Sequence[Circle], room_m: tuple[float, float]
+) -> Float[np.ndarray, "f 3"]:
+    """The path led around what is `taken`, within the walls."""
     eye = eye.copy()
     for x, y, r in taken:
         away = eye[:, :2] - [x, y]
         distance = np.linalg.norm(away, axis=1, keepdims=True)
         inside = distance[:, 0] < r
         eye[inside, :2] = [x, y] + (r * away / np.maximum(distance, 1e-3))[inside]
+    half = np.array(room_m) / 2 - CLEARANCE_M
+    eye[:, :2] = np.clip(eye[:, :2], -half, half)
     return eye
 
 

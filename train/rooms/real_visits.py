@@ -14,6 +14,7 @@ from train.furniture.collections import SourceMesh
 from train.rooms.arrangement import Circle, arrange, circle
 from train.rooms.coloring import face_colors, model_colors, palette
 from train.rooms.frames import Frames, scan_frames
+from train.rooms.furnishing import furnish
 from train.rooms.fused_scan import FusedScan, ScanSettings, fused_scan, take_frames
 from train.rooms.hand_held import blind_part, walk
 from train.rooms.mask_flaws import FEWEST
@@ -23,7 +24,7 @@ from train.rooms.surroundings import Shape, loose_clutter, shell
 from train.rooms.visits import FlyingConfig, Furnished, TrueObject
 from train.rooms.whole_room import WholeRoom, in_sight, seen_of, whole_room
 
-FLOOR_A_CIRCLE = (2.3, 3.2)  # area of the floor over that of the circles about the furniture
+FLOOR_A_CIRCLE = (1.7, 2.8)  # area of the floor over that of the circles about the furniture
 SMALLEST_ROOM_M = 3.2
 SKIPPING = 0.25  # of the scans skip a part of the room
 TALL_M = 1.0  # nobody holds a camera over what is higher
@@ -142,7 +143,10 @@ class Place:
         """Arranges the room and scans it."""
         present = {n: v for n, v in self.room.vertices.items() if index in self.room.present[n]}
         static = [n for n in present if self.room.roles[n] == "static"]
-        poses = arrange(present, before, static, self.room_m, rng, free=self.config.free)
+        if self.config.free:
+            poses = arrange(present, before, static, self.room_m, rng, free=True)
+        else:
+            poses = furnish(present, before, static, self.room_m, rng)
         whole = self._whole(present, poses, rng)
         sensor = self.config.scanned.sensor
         path = self._path(present, poses, rng)
@@ -183,7 +187,7 @@ class Place:
         taken: list[Circle] = []
         for n, v in present.items():
             x, y, r = circle(v, poses[n], self.config.free)
-            taken.append((x, y, r + 0.2 if standing[n][:, 2].max() > TALL_M else 0.7 * r))
+            taken.append((x, y, r + 0.1 if standing[n][:, 2].max() > TALL_M else 0.7 * r))
         return walk(targets, taken, self.room_m, self.config.scanned.walk, blind, rng)
 
 
