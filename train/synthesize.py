@@ -32,7 +32,7 @@ from train.rooms.fused_scan import ScanSettings
 from train.rooms.mask_flaws import MASKS, Masks
 from train.rooms.real_files import write_real_scene
 from train.rooms.real_visits import RealConfig, RealScene, real_scene
-from train.rooms.regimes import REGIMES, Regime, furniture, scene_config
+from train.rooms.regimes import REGIMES, Regime, check_scans, furniture, scene_config
 from train.rooms.scene_files import write_scene
 from train.rooms.visits import FlyingScene, flying_scene
 from train.run.program import run
@@ -82,8 +82,7 @@ def main(settings: Annotated[Settings, tyro.conf.arg(name="")]) -> None:
     s = settings
     regime, masks = _regime(s.regime), _masks(s.regime, s.masks)
     room_m = s.room_m if regime == "real" or s.room_m else ROOM_M
-    if regime != "real" or s.scans < 1:
-        scene_config("paper" if regime == "real" else regime, s.scans, np.random.default_rng(0), free=s.free)
+    check_scans(regime, s.scans)
     if s.scenes < 1 or s.seed < 0 or min(s.room_m or ROOM_M) <= 0:
         raise ValueError(
             f"{s.scenes} scenes, seed {s.seed}, room {s.room_m}; needed positive numbers, seed from 0"

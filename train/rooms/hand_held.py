@@ -32,8 +32,8 @@ class Walk:
     views_of_walls: int = 10  # other places looked at, around the room
     frames_a_view: int = 5  # from one view to the next
     most_frames: int = 300
-    step_m: float = 0.003  # drift a frame, standard deviation along each axis
-    step_deg: float = 0.08
+    step_m: float = 0.0035  # drift a frame, standard deviation along each axis
+    step_deg: float = 0.1
     pull: float = 0.08  # share of the drift that is taken back at every frame
 
 

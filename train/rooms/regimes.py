@@ -31,8 +31,7 @@ def scene_config(regime: Regime, scans: int, rng: np.random.Generator, *, free: 
     """
     if regime not in FLYING:
         raise ValueError(f"regime {regime!r}; needed one of {', '.join(FLYING)}")
-    if scans < 1 or (regime == "changes" and scans < 3):
-        raise ValueError(f"{scans} scans for regime {regime}; needed {3 if regime == 'changes' else 1}")
+    check_scans(regime, scans)
     scanned = "paper" if regime == "paper" else "sparse"
     if regime != "changes":
         return FlyingConfig(scans=scans, regime=scanned, free=free)
@@ -40,6 +39,12 @@ def scene_config(regime: Regime, scans: int, rng: np.random.Generator, *, free: 
     return FlyingConfig(
         scans=scans, regime=scanned, free=free, static=static, removed=1, added=1, returning=1
     )
+
+
+def check_scans(regime: Regime, scans: int) -> None:
+    """Raises ValueError if a scene of the regime needs more scans."""
+    if scans < (least := 3 if regime == "changes" else 1):
+        raise ValueError(f"{scans} scans for regime {regime}; needed {least}")
 
 
 def furniture(regime: Regime, models: Sequence[SourceMesh], rng: np.random.Generator) -> list[SourceMesh]:

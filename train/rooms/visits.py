@@ -83,7 +83,7 @@ class TrueObject:
 
 @dataclass(frozen=True, kw_only=True)
 class FlyingScene:
-    """Scans of one room, and the truth about them. All scans share the room's frame, but where `T_scan_room` is given."""
+    """Scans of one room, and the truth about them. All share the room's frame, but where `T_scan_room` is given."""
 
     scans: tuple[Scan, ...]
     objects: tuple[TrueObject, ...]
