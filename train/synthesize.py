@@ -1,6 +1,7 @@
 """Meshes to scenes of the open FlyingShape benchmark (paper §4).
 
 `python -m train.synthesize --source MESHES --regime paper --scenes 100 --seed 0 --out data/flying_paper`
+`python -m train.synthesize --source MESHES --regime real --masks mix --scans 2 --out data/real`
 
 Scene number i depends on the meshes, the seed and i alone. Finished scenes are kept: a stopped run resumes.
 """
@@ -12,7 +13,7 @@ import hashlib
 import json
 import os
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -27,12 +28,17 @@ from rich.progress import track
 
 from train.furniture.closed_models import cache_name, make_cached, read_cached, read_models
 from train.furniture.collections import SourceMesh
-from train.rooms.regimes import REGIMES, Regime, furniture, scene_config
+from train.rooms.fused_scan import ScanSettings
+from train.rooms.mask_flaws import MASKS, Masks
+from train.rooms.real_files import write_real_scene
+from train.rooms.real_visits import RealConfig, RealScene, real_scene
+from train.rooms.regimes import REGIMES, Regime, check_scans, furniture, scene_config
 from train.rooms.scene_files import write_scene
 from train.rooms.visits import FlyingScene, flying_scene
 from train.run.program import run
 
 ATTEMPTS = 4  # at furnishing a scene, before the room is called impossible
+ROOM_M = (7.0, 6.0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,7 +48,7 @@ class Settings:
     source: Path
     """Folder of meshes, packed .npz, or whatever else train.prepare reads."""
     regime: str
-    """paper, sparse, identical or changes."""
+    """paper, sparse, identical, changes or real."""
     out: Path
     """Folder of the scenes."""
     scenes: int = 100
@@ -61,8 +67,10 @@ class Settings:
     """Of meshes that come without one."""
     attribution: str | None = None
     """Who is to be named, for LICENSES.md."""
-    room_m: tuple[float, float] = (7.0, 6.0)
-    """Floor, x by y."""
+    masks: str | None = None
+    """Of regime real: perfect (as without), cut, dirty, split, merged or mix."""
+    room_m: tuple[float, float] | None = None
+    """Floor, x by y; 7 by 6 without, in regime real as the furniture needs."""
     cache: Path | None = None
     """Folder of closed models, to share between benchmarks; inside `out` otherwise."""
     workers: int = 0
@@ -72,8 +80,10 @@ class Settings:
 def main(settings: Annotated[Settings, tyro.conf.arg(name="")]) -> None:
     """Writes scenes with ground truth, index.json, LICENSES.md and report.json (models left out, and why)."""
     s = settings
-    scene_config(_regime(s.regime), s.scans, np.random.default_rng(0), free=s.free)
-    if s.scenes < 1 or s.seed < 0 or min(s.room_m) <= 0:
+    regime, masks = _regime(s.regime), _masks(s.regime, s.masks)
+    room_m = s.room_m if regime == "real" or s.room_m else ROOM_M
+    check_scans(regime, s.scans)
+    if s.scenes < 1 or s.seed < 0 or min(s.room_m or ROOM_M) <= 0:
         raise ValueError(
             f"{s.scenes} scenes, seed {s.seed}, room {s.room_m}; needed positive numbers, seed from 0"
         )
@@ -83,11 +93,12 @@ def main(settings: Annotated[Settings, tyro.conf.arg(name="")]) -> None:
         meshes=tuple(meshes),
         cache=s.cache or s.out / "models",
         out=s.out,
-        regime=_regime(s.regime),
+        regime=regime,
         free=s.free,
         scans=s.scans,
         seed=s.seed,
-        room_m=s.room_m,
+        room_m=room_m,
+        masks=masks,
     )
     claim(job)
     with processes(job, s.workers) as pool:
@@ -108,6 +119,15 @@ def _regime(name: str) -> Regime:
     raise ValueError(f"regime {name!r}; needed one of {', '.join(REGIMES)}")
 
 
+def _masks(regime: str, name: str | None) -> Masks:
+    """Raises ValueError if there are no such masks, or the regime has true ones only."""
+    if name is not None and (regime != "real" or name not in MASKS):
+        raise ValueError(
+            f"masks {name!r} in regime {regime}; needed one of {', '.join(MASKS)}, in regime real"
+        )
+    return next((m for m in MASKS if m == name), "perfect")
+
+
 @dataclass(frozen=True, kw_only=True)
 class Job:
     """Everything that scenes depend on, but their number."""
@@ -119,7 +139,8 @@ class Job:
     free: bool
     scans: int
     seed: int
-    room_m: tuple[float, float]
+    room_m: tuple[float, float] | None
+    masks: Masks = "perfect"
 
     @property
     def facts(self) -> dict[str, Any]:
@@ -131,8 +152,9 @@ class Job:
             "free": self.free,
             "seed": self.seed,
             "scans_a_scene": self.scans,
-            "room_m": list(self.room_m),
+            "room_m": self.room_m and list(self.room_m),
             "models": models.hexdigest(),
+            **({"masks": self.masks} if self.regime == "real" else {}),
         }
 
 
@@ -192,24 +214,39 @@ def make_scene(number: int) -> str:
         return json.loads(done.read_text())["digest"]
     models, symmetry = usable_models(job)
     rng = np.random.default_rng((job.seed, number))
-    scene = _furnished(job, models, rng, name)
+    facts = {**job.facts, "number": number}
+    scene = _attempted(partial(_furnished, job, models, rng, name))
     # A rescaled copy has the symmetry of what it is a copy of only up to half a turn: it is left unmeasured.
     objects = tuple(dataclasses.replace(o, symmetry_order=symmetry.get(o.model)) for o in scene.objects)
+    if isinstance(scene, RealScene):
+        return write_real_scene(job.out / name, dataclasses.replace(scene, objects=objects), facts)
     scene = dataclasses.replace(scene, objects=objects, regime=job.regime)
-    return write_scene(job.out / name, scene, {**job.facts, "number": number}, rng)
+    return write_scene(job.out / name, scene, facts, rng)
 
 
-def _furnished(job: Job, models: list[SourceMesh], rng: np.random.Generator, name: str) -> FlyingScene:
+def _attempted(furnished: Callable[[], FlyingScene | RealScene]) -> FlyingScene | RealScene:
     """A scene; other furniture where the first does not fit. ValueError if none fits."""
     last = ValueError("no furniture fits")
     for _ in range(ATTEMPTS):
-        config = scene_config(job.regime, job.scans, rng, free=job.free)
-        chosen = furniture(job.regime, models, rng)
         try:
-            return flying_scene(chosen, dataclasses.replace(config, room_m=job.room_m), rng, name)
+            return furnished()
         except ValueError as error:
             last = error
     raise last
+
+
+def _furnished(
+    job: Job, models: list[SourceMesh], rng: np.random.Generator, name: str
+) -> FlyingScene | RealScene:
+    """A scene of the job's regime. ValueError if the furniture that is drawn does not fit."""
+    if job.regime == "real":
+        chosen = furniture(job.regime, models, rng)
+        scanned = ScanSettings(masks=job.masks)
+        config = RealConfig(scans=job.scans, free=job.free, room_m=job.room_m, scanned=scanned)
+        return real_scene(chosen, config, rng, name)
+    config = scene_config(job.regime, job.scans, rng, free=job.free)
+    chosen = furniture(job.regime, models, rng)
+    return flying_scene(chosen, dataclasses.replace(config, room_m=job.room_m or ROOM_M), rng, name)
 
 
 @lru_cache(maxsize=1)

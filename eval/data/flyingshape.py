@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Sequence
 from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 
+from eval.data.masks import LOST
 from eval.data.truth import Benchmark, KnownObject, KnownScene
+from more2_jax.geometry.poses import Pose
 from more2_jax.scans.files.json_file import read_json
 from more2_jax.scans.files.npz import read_arrays
 from more2_jax.types import Instance, Mesh, Scan
@@ -44,6 +47,7 @@ def open_flyingshape(folder: Path) -> Benchmark:
     files = {name: path for name, path in files.items() if path.suffix != ".partial"}
     first = read_json(next(iter(files.values())) / "scene.json")
     facts = {k: first.get(k) for k in ("regime", "free", "seed", "models")}
+    facts |= {"masks": first["masks"]} if "masks" in first else {}
     return Benchmark(
         names=tuple(files),
         read=lambda name: read_open(files[name]),
@@ -56,23 +60,29 @@ def open_flyingshape(folder: Path) -> Benchmark:
 def read_open(folder: Path) -> KnownScene:
     """One scene with the truth."""
     scene = read_scene(folder)
-    objects = tuple(known(o) for o in scene.objects)
+    objects = tuple(known(o, scene.T_scan_room) for o in scene.objects if o.instance)
     return KnownScene(name=folder.name, scans=scene.scans, objects=objects, facts={"regime": scene.regime})
 
 
-def known(o: TrueObject) -> KnownObject:
-    """A benchmark's object with its measured symmetry."""
-    reference = o.T_scan_model[min(o.instance)]
+def known(o: TrueObject, T_scan_room: Sequence[Pose] = ()) -> KnownObject:
+    """A benchmark's object with its measured symmetry; `T_scan_room` where scans have frames of their own.
+
+    Where its only mask is mostly another object's, the object is `LOST`: it is there, and stays in all denominators,
+    though no instance is it.
+    """
+    poses = {k: np.linalg.inv(T_scan_room[k]) @ T if T_scan_room else T for k, T in o.T_scan_model.items()}
+    reference = poses[min(o.instance)]
     return KnownObject(
         name=o.name,
         category=o.category,
         copies=o.model,
-        instance=o.instance,
+        instance={k: LOST if k in o.merged else i for k, i in o.instance.items()},
         T_scan_model=o.T_scan_model,
         symmetry=symmetry_of(o.vertices.astype(np.float64).tobytes(), o.faces.astype(np.int64).tobytes()),
         mesh=Mesh(vertices=o.vertices, faces=o.faces),
-        moved={k: bool(np.abs(T - reference).max() > 1e-6) for k, T in o.T_scan_model.items()},
+        moved={k: bool(np.abs(T - reference).max() > 1e-6) for k, T in poses.items()},
         canonical=LONGEST / float(np.ptp(o.vertices, axis=0).max()),
+        parts={k: ids for k, ids in o.parts.items() if k not in o.merged and ids},
     )
 
 

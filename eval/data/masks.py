@@ -36,7 +36,7 @@ def associated(scene: KnownScene, scans: Sequence[Scan]) -> KnownScene:
     """
     shown = [best_masks(old, new) for old, new in zip(scene.scans, scans, strict=True)]
     objects = tuple(
-        dataclasses.replace(o, instance={k: shown[k].get(i, LOST) for k, i in o.instance.items()})
+        dataclasses.replace(o, instance={k: shown[k].get(i, LOST) for k, i in o.instance.items()}, parts={})
         for o in scene.objects
     )
     return dataclasses.replace(scene, scans=tuple(scans), objects=objects)

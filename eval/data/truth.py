@@ -15,7 +15,8 @@ from train.furniture.symmetry import SymmetryGroup
 
 @dataclass(frozen=True, kw_only=True)
 class KnownObject:
-    """One object over all scans. The keys of `instance` and `T_scan_model` are the scans that have it.
+    """One object over all scans. The keys of `T_scan_model` are the scans that have it, those of `instance` the scans
+    that show it: where a person did not look, an object is there and not seen.
 
     Objects with the same `copies` look alike and share a model frame, so each may stand in for the other.
     """
@@ -30,11 +31,19 @@ class KnownObject:
     forgiven_deg: tuple[float, ...] = (90.0, 180.0)  # by the published evaluation
     moved: dict[int, bool] = field(default_factory=dict)  # since the first scan; absent: not known
     canonical: float = 1.0  # canonical units a meter
+    parts: dict[int, tuple[int, ...]] = field(
+        default_factory=dict
+    )  # where masks are split: all that are mostly its own
 
     @property
     def first(self) -> int:
         """The scan in which it is seen first."""
         return min(self.instance)
+
+    def masks(self, scan: int) -> tuple[int, ...]:
+        """Every instance of a scan that shows it."""
+        main = (self.instance[scan],) if scan in self.instance else ()
+        return self.parts.get(scan, main)
 
     def true_pose(self, other: KnownObject, scan: int, ref: int) -> Pose:
         """`T_ref_scan` that lays `other` (itself, or a copy) as scan `scan` saw it onto this one in scan `ref`."""
@@ -65,8 +74,8 @@ class KnownScene:
         return replace(self, scans=self.scans[:count], objects=tuple(o for o in objects if o.instance))
 
     def owner(self, scan: int, instance: int) -> KnownObject | None:
-        """The object that an instance of a scan shows."""
-        return next((o for o in self.objects if o.instance.get(scan) == instance), None)
+        """The object that an instance of a scan shows, be it the smaller part of a split one."""
+        return next((o for o in self.objects if instance in o.masks(scan)), None)
 
     def instance(self, scan: int, id_: int) -> Instance:
         """An instance by its id; KeyError if the scan has none of it."""

@@ -104,16 +104,25 @@ def object_recall(o: KnownObject, track: Track | None, samples: int) -> dict[str
 
 
 def changes_f1(scene: KnownScene, tracks: Sequence[Track]) -> float:
-    """F1 of added and removed between scans that follow each other: instances that begin or end a presence."""
-    said, true = set[str](), set[str]()
+    """F1 of added and removed between scans that follow each other: instances that begin or end a presence.
+
+    An object that is there and not seen has not come or gone, and a method cannot know: what is said of it at such a
+    scan counts neither way.
+    """
+    said, true, open_ = set[str](), set[str](), set[str]()
     for k in range(1, len(scene.scans)):
-        for presence, found in (
-            ([t.instance for t in tracks], said),
-            ([o.instance for o in scene.objects], true),
-        ):
-            found |= {f"added {k} {p[k]}" for p in presence if k in p and k - 1 not in p}
-            found |= {f"removed {k} {p[k - 1]}" for p in presence if k - 1 in p and k not in p}
-    return f1(said, true)
+        for name, here, other in (("added", k, k - 1), ("removed", k - 1, k)):
+            said |= {
+                f"{name} {k} {t.instance[here]}"
+                for t in tracks
+                if here in t.instance and other not in t.instance
+            }
+            for o in (o for o in scene.objects if here in o.instance and other not in o.instance):
+                if other in o.T_scan_model:
+                    open_ |= {f"{name} {k} {i}" for i in o.masks(here)}
+                else:
+                    true.add(f"{name} {k} {o.instance[here]}")
+    return f1(said - open_, true)
 
 
 def f1(predicted: set[str], truth: set[str]) -> float:

@@ -18,7 +18,7 @@ from train import synthesize
 from train.furniture.closed_models import closed_model, make_cached, read_models
 from train.furniture.collections import SourceMesh, write_packed
 from train.rooms.cameras import SPARSE
-from train.rooms.regimes import REGIMES, balanced, by_category, furniture, near_twin, scene_config
+from train.rooms.regimes import FLYING, balanced, by_category, furniture, near_twin, scene_config
 from train.rooms.scene_files import GRID_M, read_scene
 from train.rooms.visits import FlyingScene, TrueObject, surface_samples
 
@@ -83,7 +83,7 @@ CASES = [
         id=f"{r}-{'free' if f else 'upright'}",
         marks=[pytest.mark.slow] if f and r != "sparse" else [],
     )
-    for r in REGIMES
+    for r in FLYING
     for f in (False, True)
 ]
 

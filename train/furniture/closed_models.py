@@ -5,11 +5,11 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-import os
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import Literal
+from uuid import uuid4
 
 import numpy as np
 
@@ -86,7 +86,10 @@ def cache_name(mesh: SourceMesh) -> str:
 
 
 def make_cached(mesh: SourceMesh, cache: Path) -> str | None:
-    """Closes the mesh and keeps it in `cache`; returns why that is impossible, or None. A second call is free."""
+    """Closes the mesh and keeps it in `cache`; returns why that is impossible, or None. A second call is free.
+
+    Any number of processes, on any machines, may share the folder: files are named by content and renamed whole.
+    """
     target = cache / cache_name(mesh)
     reasons = target.with_suffix(".json")
     if target.exists():
@@ -98,14 +101,14 @@ def make_cached(mesh: SourceMesh, cache: Path) -> str | None:
     except ValueError as error:
         _atomically(reasons, json.dumps({"reason": str(error)}).encode())
         return str(error)
-    partial = target.with_suffix(f".{os.getpid()}.partial.npz")
+    partial = target.with_suffix(f".{uuid4().hex}.partial.npz")
     np.savez(partial, vertices=model.vertices, faces=model.faces.astype(np.int32), symmetry=symmetry)
     partial.replace(target)
     return None
 
 
 def _atomically(path: Path, content: bytes) -> None:
-    partial = path.with_suffix(f".{os.getpid()}.partial")
+    partial = path.with_suffix(f".{uuid4().hex}.partial")
     partial.write_bytes(content)
     partial.replace(path)
 

@@ -1,4 +1,4 @@
-"""The four regimes of the open FlyingShape benchmark: which models a scene is furnished with, and their roles."""
+"""The regimes of the open FlyingShape benchmark: which models a scene is furnished with, and their roles."""
 
 from __future__ import annotations
 
@@ -11,9 +11,12 @@ import numpy as np
 from train.furniture.source_mesh import SourceMesh, standing
 from train.rooms.visits import FlyingConfig
 
-Regime = Literal["paper", "sparse", "identical", "changes"]
-REGIMES: tuple[Regime, ...] = get_args(Regime)
+Flying = Literal["paper", "sparse", "identical", "changes"]  # scanned by standing cameras (`visits`)
+Regime = Literal[Flying, "real"]  # scanned by hand (`real_visits`)
+FLYING: tuple[Flying, ...] = get_args(Flying)
+REGIMES: tuple[Regime, ...] = (*FLYING, "real")
 OBJECTS = (4, 8)  # in a scene, least and most (paper §4)
+REAL_OBJECTS = (5, 8)
 CHANGES_OBJECTS = (6, 8)  # so that every role is played and two objects move
 COPIES = (2, 4)  # of the same model in a scene of `identical`
 TWIN_SCALE = (0.04, 0.08)  # by how much a near-twin is larger or smaller along each axis
@@ -26,10 +29,9 @@ def scene_config(regime: Regime, scans: int, rng: np.random.Generator, *, free: 
     `changes` has a static, a removed, an added and a returning object, sometimes two static ones; in the
     others every pose changes. Raises ValueError for an unknown regime, or `changes` in less than 3 scans.
     """
-    if regime not in REGIMES:
-        raise ValueError(f"regime {regime!r}; needed one of {', '.join(REGIMES)}")
-    if scans < 1 or (regime == "changes" and scans < 3):
-        raise ValueError(f"{scans} scans for regime {regime}; needed {3 if regime == 'changes' else 1}")
+    if regime not in FLYING:
+        raise ValueError(f"regime {regime!r}; needed one of {', '.join(FLYING)}")
+    check_scans(regime, scans)
     scanned = "paper" if regime == "paper" else "sparse"
     if regime != "changes":
         return FlyingConfig(scans=scans, regime=scanned, free=free)
@@ -39,12 +41,18 @@ def scene_config(regime: Regime, scans: int, rng: np.random.Generator, *, free: 
     )
 
 
+def check_scans(regime: Regime, scans: int) -> None:
+    """Raises ValueError if a scene of the regime needs more scans."""
+    if scans < (least := 3 if regime == "changes" else 1):
+        raise ValueError(f"{scans} scans for regime {regime}; needed {least}")
+
+
 def furniture(regime: Regime, models: Sequence[SourceMesh], rng: np.random.Generator) -> list[SourceMesh]:
     """The models of one scene, categories balanced; in `identical`, copies and near-twins of one of them.
 
     `models` are in a fixed order, their names unique. Raises ValueError if they are fewer than a scene needs.
     """
-    least, most = CHANGES_OBJECTS if regime == "changes" else OBJECTS
+    least, most = {"changes": CHANGES_OBJECTS, "real": REAL_OBJECTS}.get(regime, OBJECTS)
     if len(models) < most:
         raise ValueError(f"{len(models)} usable models; needed {most}")
     count = int(rng.integers(least, most + 1))

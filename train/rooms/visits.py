@@ -48,7 +48,11 @@ class FlyingConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class TrueObject:
-    """One object of the room over all visits; the keys are the scans that have it."""
+    """One object of the room over all visits; the keys are the scans that have it.
+
+    In regime `real` a scan may have an object and not show it: `instance` then lacks the scan. −1 is an object that
+    a scan shows and no mask has.
+    """
 
     name: str
     model: str  # of identical objects the same
@@ -62,6 +66,10 @@ class TrueObject:
     symmetry_order: int | None = None  # about the vertical, see `symmetry.yaw_symmetry`; None: not measured
     license: str = "unknown"
     source: str = ""
+    parts: dict[int, tuple[int, ...]] = field(
+        default_factory=dict
+    )  # where masks are predicted: all that show it
+    merged: frozenset[int] = frozenset()  # scans whose `instance` is mostly another object's
 
     def visible(self, scan: int) -> float:
         """Share of the surface that the scan sees."""
@@ -75,7 +83,7 @@ class TrueObject:
 
 @dataclass(frozen=True, kw_only=True)
 class FlyingScene:
-    """Scans of one room, and the truth about them. All scans share the room's frame."""
+    """Scans of one room, and the truth about them. All share the room's frame, but where `T_scan_room` is given."""
 
     scans: tuple[Scan, ...]
     objects: tuple[TrueObject, ...]
@@ -84,6 +92,10 @@ class FlyingScene:
     ] = ()  # a scan; camera: x right, y down, z forward
     name: str = "room"
     regime: str = "sparse"
+    T_scan_room: tuple[Pose, ...] = ()
+    looked_at: tuple[
+        dict[str, float], ...
+    ] = ()  # regime `real`, a scan: how much of an object's last place it saw
 
 
 def flying_scene(

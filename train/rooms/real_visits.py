@@ -1,0 +1,214 @@
+"""Rooms as a person scans them, visit after visit: hand-held, fused, cluttered, in frames of their own, badly masked.
+
+`real_scene` is what `visits.flying_scene` is for the other regimes. Deterministic by the generator's seed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from train.furniture.collections import SourceMesh
+from train.rooms.arrangement import Circle, arrange, circle
+from train.rooms.coloring import face_colors, model_colors, palette
+from train.rooms.frames import Frames, scan_frames
+from train.rooms.furnishing import furnish
+from train.rooms.fused_scan import FusedScan, ScanSettings, fused_scan, take_frames
+from train.rooms.hand_held import blind_part, walk
+from train.rooms.mask_flaws import FEWEST
+from train.rooms.mask_truth import Shown, shown_by
+from train.rooms.ray_scanner import PlacedMesh, Pose, footprint_radius
+from train.rooms.surroundings import Shape, loose_clutter, shell
+from train.rooms.visits import FlyingConfig, Furnished, TrueObject
+from train.rooms.whole_room import WholeRoom, in_sight, seen_of, whole_room
+
+FLOOR_A_CIRCLE = (1.7, 2.8)  # area of the floor over that of the circles about the furniture
+SMALLEST_ROOM_M = 3.2
+SKIPPING = 0.25  # of the scans skip a part of the room
+TALL_M = 1.0  # nobody holds a camera over what is higher
+
+
+@dataclass(frozen=True)
+class RealConfig:
+    """What changes between visits, and how they are scanned."""
+
+    scans: int = 2
+    free: bool = False  # any rest orientation instead of upright
+    room_m: tuple[float, float] | None = None  # floor, x by y; None: as the furniture needs
+    scanned: ScanSettings = field(default_factory=ScanSettings)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RealScene:
+    """Scans of one room, and the truth about them."""
+
+    name: str
+    scans: tuple[FusedScan, ...]
+    objects: tuple[TrueObject, ...]
+    shown: tuple[dict[str, Shown], ...]  # a scan: how masks show the objects that it shows
+    looked_at: tuple[dict[str, float], ...]  # a scan: share of each object's last place within sight
+    T_room_camera: tuple[np.ndarray, ...]  # a scan: (frames, 4, 4), true
+    frames: Frames
+    room_m: tuple[float, float]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Visit:
+    """One visit: where everything stood, and its scan."""
+
+    poses: dict[str, Pose]
+    scan: FusedScan
+    shown: dict[str, Shown]
+    seen: dict[str, np.ndarray]
+    looked_at: dict[str, float]
+    path: np.ndarray
+
+
+def real_scene(
+    models: Sequence[SourceMesh], config: RealConfig, rng: np.random.Generator, name: str = "room"
+) -> RealScene:
+    """Furnishes a room with `models` (meters, z up), and has a person scan it `config.scans` times.
+
+    Raises ValueError if there is no room for the furniture, or nowhere to stand.
+    """
+    furnished = Furnished.of(models, _roles(len(models), config, rng), rng)
+    room_m = config.room_m or _room_for([footprint_radius(v) for v in furnished.vertices.values()], rng)
+    kind: Frames = "own" if rng.random() < 0.5 else "aligned"
+    frames = scan_frames(kind, config.scans, rng)
+    place = Place(
+        room=furnished,
+        room_m=room_m,
+        shell=shell(room_m, rng),
+        colors=_colors(furnished, rng),
+        config=config,
+    )
+    visits: list[Visit] = []
+    last: dict[str, Pose] = {}  # where each object stood when it was there last
+    for index in range(config.scans):
+        visits.append(place.visit(index, visits[-1].poses if visits else {}, last, frames[index], rng))
+        last |= visits[-1].poses
+    return RealScene(
+        name=name,
+        scans=tuple(v.scan for v in visits),
+        objects=tuple(_object(n, furnished, visits) for n in furnished.vertices),
+        shown=tuple(v.shown for v in visits),
+        looked_at=tuple(v.looked_at for v in visits),
+        T_room_camera=tuple(v.path for v in visits),
+        frames=kind,
+        room_m=room_m,
+    )
+
+
+def _roles(count: int, config: RealConfig, rng: np.random.Generator) -> FlyingConfig:
+    """Some objects stay, at most one goes, at most one comes, the others move at every visit."""
+    removed, added = (int(rng.integers(2)) if config.scans > 1 else 0 for _ in range(2))
+    static = int(rng.integers(1, max(2, count - removed - added)))
+    return FlyingConfig(scans=config.scans, static=static, removed=removed, added=added, free=config.free)
+
+
+def _room_for(radii: Sequence[float], rng: np.random.Generator) -> tuple[float, float]:
+    """A floor with some room between circles of these radii."""
+    area = rng.uniform(*FLOOR_A_CIRCLE) * np.pi * sum(r * r for r in radii)
+    least = max(SMALLEST_ROOM_M, 2 * max(radii) + 0.5)
+    y = max(least, float(np.sqrt(area * rng.uniform(0.65, 1.0))))
+    return round(max(least, area / y), 3), round(y, 3)
+
+
+def _colors(room: Furnished, rng: np.random.Generator) -> dict[str, np.ndarray]:
+    """Colors of the faces of every object."""
+    by_model = model_colors([m.name for m in room.models.values()], palette(rng), rng)
+    return {n: face_colors(room.vertices[n], m.faces, by_model[m.name]) for n, m in room.models.items()}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Place:
+    """A room over all visits."""
+
+    room: Furnished
+    room_m: tuple[float, float]
+    shell: list[Shape]
+    colors: dict[str, np.ndarray]
+    config: RealConfig
+
+    def visit(
+        self,
+        index: int,
+        before: Mapping[str, Pose],
+        last: Mapping[str, Pose],
+        T_scan_room: Pose,
+        rng: np.random.Generator,
+    ) -> Visit:
+        """Arranges the room and scans it."""
+        present = {n: v for n, v in self.room.vertices.items() if index in self.room.present[n]}
+        static = [n for n in present if self.room.roles[n] == "static"]
+        if self.config.free:
+            poses = arrange(present, before, static, self.room_m, rng, free=True)
+        else:
+            poses = furnish(present, before, static, self.room_m, rng)
+        whole = self._whole(present, poses, rng)
+        sensor = self.config.scanned.sensor
+        path = self._path(present, poses, rng)
+        frames = take_frames(whole, path, sensor, rng)
+        names = list(present)
+        scan = fused_scan(whole, frames, len(names), T_scan_room, self.config.scanned, rng)
+        shown = shown_by(scan.instance, scan.owner, len(names), FEWEST)
+        where = {n: _placed(self.room.samples[n], p) for n, p in poses.items()}
+        expected = {n: _placed(self.room.samples[n], p) for n, p in {**poses, **last}.items()}
+        return Visit(
+            poses=poses,
+            scan=scan,
+            shown={names[k]: s for k, s in shown.items()},
+            seen={n: seen_of(where[n], k, whole.owner, frames, sensor) for k, n in enumerate(names)},
+            looked_at={n: float(in_sight(p, frames, sensor).mean()) for n, p in expected.items()},
+            path=path,
+        )
+
+    def _whole(
+        self, present: Mapping[str, np.ndarray], poses: Mapping[str, Pose], rng: np.random.Generator
+    ) -> WholeRoom:
+        """Furniture as it stands, with clutter of this visit."""
+        placed = [
+            PlacedMesh(model=n, vertices=v, faces=self.room.models[n].faces, T_room_model=poses[n])
+            for n, v in present.items()
+        ]
+        taken = [circle(v, poses[n], self.config.free) for n, v in present.items()]
+        shapes = [*self.shell, *loose_clutter(self.room_m, taken, rng)]
+        return whole_room(placed, [self.colors[n] for n in present], shapes)
+
+    def _path(
+        self, present: Mapping[str, np.ndarray], poses: Mapping[str, Pose], rng: np.random.Generator
+    ) -> np.ndarray:
+        """A walk that looks at every object, but for those in the part that one scan in four skips."""
+        blind = blind_part(self.room_m, rng) if rng.random() < SKIPPING else None
+        standing = {n: _placed(v, poses[n]) for n, v in present.items()}
+        targets = [(v.min(axis=0) + v.max(axis=0)) / 2 for v in standing.values()]
+        taken: list[Circle] = []
+        for n, v in present.items():
+            x, y, r = circle(v, poses[n], self.config.free)
+            taken.append((x, y, r + 0.1 if standing[n][:, 2].max() > TALL_M else 0.7 * r))
+        return walk(targets, taken, self.room_m, self.config.scanned.walk, blind, rng)
+
+
+def _placed(points: np.ndarray, pose: Pose) -> np.ndarray:
+    return points @ pose[:3, :3].T + pose[:3, 3]
+
+
+def _object(name: str, room: Furnished, visits: Sequence[Visit]) -> TrueObject:
+    """The truth about one object; its poses are in the frames of the scans, also of those that do not show it."""
+    there = {k: v for k, v in enumerate(visits) if name in v.poses}
+    model = room.models[name]
+    return TrueObject(
+        name=name,
+        model=model.name,
+        category=model.category,
+        vertices=room.vertices[name],
+        faces=model.faces,
+        instance={k: v.shown[name].instance for k, v in there.items() if name in v.shown},
+        T_scan_model={k: np.round(v.scan.T_scan_room @ v.poses[name], 9) for k, v in there.items()},
+        role=room.roles[name],
+        seen={k: v.seen[name] for k, v in there.items()},
+        license=model.license,
+        source=model.source,
+    )
