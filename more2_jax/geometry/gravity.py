@@ -14,17 +14,17 @@ from more2_jax.geometry.poses import Points, Pose
 Direction = Float[np.ndarray, "3"]
 
 MAX_TILT_DEG = 10.0  # farther from z nothing is looked for: z is then not meant to be up
-GRID_DEG = 1.0  # between the directions tried first
+GRIDS_DEG = (1.0, 0.25, 0.08)  # between the directions tried: all about z, then those about the best
 BIN_M = 0.02  # of the histograms of heights
 BAND_M = 0.03  # half the thickness of a level: a floor's waves and a depth camera's noise
-ROUNDS = 12  # of finding levels and fitting their normal
+ROUNDS = 8  # of finding levels and fitting their normal
 SCALE_M = 0.015  # of the Geman-McClure weights: a point that far off its level counts a quarter
 LEAST_ON_LEVELS = 0.05  # share of the points that levels must hold together, walls through them left out,
 LEAST_ON_LEVEL = 0.02  # and each of them
 LEAST_POINTS = 200
 LEAST_WIDTH_M = 0.2  # standard deviation of the levels' points, the narrower way
 STRAY = 0.005  # share of the points cut off at either end of every axis
-TRIED_POINTS = 5000  # at even steps, on the grid of directions
+TRIED_POINTS = 5000  # at even steps, along the directions tried
 MOST_POINTS = 20_000  # at even steps, for the rest
 
 
@@ -67,7 +67,7 @@ def gravity(points: Points) -> Gravity | None:
             return None
         up = fitted
     found = Gravity(up=up, share=float(share))
-    return found if found.tilt_deg <= MAX_TILT_DEG + GRID_DEG else None
+    return found if found.tilt_deg <= MAX_TILT_DEG + GRIDS_DEG[0] else None
 
 
 def least_turn(up: Direction) -> Float[np.ndarray, "3 3"]:
@@ -88,20 +88,23 @@ def about_middle(points: Points) -> Points:
     return kept - np.median(kept, axis=0) if len(kept) else kept
 
 
-def tried_directions() -> Float[np.ndarray, "k 3"]:
-    """Directions within `MAX_TILT_DEG` of z, about `GRID_DEG` apart."""
-    steps = np.deg2rad(np.arange(-MAX_TILT_DEG, MAX_TILT_DEG + GRID_DEG / 2, GRID_DEG))
-    slope = np.tan(np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2))
-    up = np.column_stack([slope, np.ones(len(slope))])
-    up = up[np.hypot(*slope.T) <= np.tan(np.deg2rad(MAX_TILT_DEG + GRID_DEG / 2))]
-    return up / np.linalg.norm(up, axis=1, keepdims=True)
-
-
 def sharpest(points: Points) -> Direction:
-    """Of the directions tried, the one along which heights gather most: the largest sum of squared counts."""
-    tried = tried_directions()
-    scores = [np.sum(np.convolve(counted(h), [1, 2, 1]) ** 2) for h in (points @ tried.T).T]
-    return tried[int(np.argmax(scores))]
+    """Of the directions near z, the one along which heights gather most: the largest sum of squared counts."""
+    slope, reach_deg = np.zeros(2), MAX_TILT_DEG
+    for step_deg in GRIDS_DEG:
+        tried = slopes_about(slope, reach_deg, step_deg)
+        heights = points[:, 2] + tried @ points[:, :2].T
+        scores = [np.sum(np.convolve(counted(h), [1, 2, 1]) ** 2) for h in heights]
+        slope, reach_deg = tried[int(np.argmax(scores))], step_deg
+    up = np.array([*slope, 1.0])
+    return up / np.linalg.norm(up)
+
+
+def slopes_about(slope: Float[np.ndarray, "2"], reach_deg: float, step_deg: float) -> Float[np.ndarray, "k 2"]:
+    """Slopes (x and y to a z of 1) on a square grid within `reach_deg` of one."""
+    steps = np.tan(np.deg2rad(np.arange(-reach_deg, reach_deg + step_deg / 2, step_deg)))
+    grid = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
+    return slope + grid[np.hypot(*grid.T) <= np.tan(np.deg2rad(reach_deg + step_deg / 2))]
 
 
 def counted(height: Float[np.ndarray, " n"]) -> Int[np.ndarray, " b"]:
