@@ -21,6 +21,7 @@ from more2_jax.config import SceneConfig, preset
 from more2_jax.metrics import symmetry_aware_rotation_error_deg
 from more2_jax.network.prior import Prior, load_prior
 from more2_jax.scene import add_scan, start_scene
+from more2_jax.tracking.objects import reference_pose
 from more2_jax.types import LivingScene
 from train.furniture.collections import SourceMesh, read_meshes
 from train.furniture.heldout import read_ikea
@@ -107,7 +108,8 @@ def score_room(scene: LivingScene, room: FlyingScene) -> dict[str, float | None]
     for true in pairs:
         seen = found[true.instance[0]].observations[1:]
         matched.append(bool(seen) and seen[0].instance == true.instance[1])
-        right.append(matched[-1] and rotation_error(true, seen[0].T_ref_scan) < RIGHT_DEG)
+        T = np.linalg.inv(reference_pose(found[true.instance[0]]))
+        right.append(matched[-1] and rotation_error(true, T @ seen[0].T_ref_scan) < RIGHT_DEG)
     gone = {o.name for o in room.objects if set(o.instance) == {0}}
     came = {o.name for o in room.objects if set(o.instance) == {1}}
     first, second = ({o.instance[s]: o.name for o in room.objects if s in o.instance} for s in (0, 1))

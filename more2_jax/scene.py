@@ -19,6 +19,7 @@ from more2_jax.progress import Watcher, staged
 from more2_jax.refinement.joint_of_objects import embed_accumulated, fit_objects
 from more2_jax.refinement.pose_graph_of_objects import refine_object_poses
 from more2_jax.tracking.identify import identify
+from more2_jax.tracking.leveling import frame_as_given, level_of, leveled, poses_as_given
 from more2_jax.tracking.object_views import few_sensors, instance_sights, object_sights
 from more2_jax.tracking.objects import (
     SCENE_FRAME,
@@ -40,17 +41,19 @@ def start_scene(
 
     `progress` is told of every stage, here and below.
     """
-    instances, skipped = usable(scan, config)
+    T_level_scan = level_for(scan, config)
+    instances, skipped = usable(leveled(scan, T_level_scan), config)
     timing: dict[str, float] = {}
     with staged(timing, progress, "encode", len(instances), scan=scan.name):
         embeddings = embed(prior, [i.points for i in instances])
     objects = [new_object(k, 0, i, e) for k, (i, e) in enumerate(zip(instances, embeddings, strict=True))]
+    frame = frame_as_given(SCENE_FRAME, T_level_scan)
     return LivingScene(
         preset=config.preset,
         prior=prior.name,
         upright=config.upright,
-        scans=(record(0, scan, instances, skipped),),
-        objects=tuple(objects),
+        scans=(record(0, scan, instances, skipped, frame),),
+        objects=tuple(poses_as_given(objects, 0, frame, T_level_scan)),
         changes=(),
         timing_s=timing,
     )
@@ -64,15 +67,17 @@ def add_scan(
     Objects that were absent for a while can come back. Meshes of objects seen again are dropped; `reconstruct`
     makes them anew. Raises ValueError if the scan has no usable instance.
     """
-    instances, skipped = usable(scan, config)
+    T_level_scan = level_for(scan, config, scene.scans[0])
+    level = leveled(scan, T_level_scan)
+    instances, skipped = usable(level, config)
     index, timing, objects = len(scene.scans), dict(scene.timing_s), list(scene.objects)
     stage = partial(staged, timing, progress, scan=scan.name)
     with stage("encode", len(instances)):
         embeddings = embed(prior, [i.points for i in instances])
     with stage("match", len(instances)):
-        old, new = compared_objects(scene, instances, embeddings, scan, config)
+        old, new = compared_objects(scene, instances, embeddings, level, config)
         known = [o for o, _ in old]
-        identified = identify(prior, known, new, config, rooms_of(scene, scan))
+        identified = identify(prior, known, new, config, rooms_of(scene, level))
     found, chance = identified.found, {objects[k].id: p for k, p in identified.gone.items()}
     with stage("register", len(found)):
         seen, frame = relocalize(prior, objects, old, instances, new, identified, index, config)
@@ -88,6 +93,8 @@ def add_scan(
     for i in (i for i in range(len(instances)) if i not in matched):
         objects.append(new_object(len(objects), index, instances[i], embeddings[i], frame))
         chance |= {objects[-1].id: identified.new[i]} if i in identified.new else {}
+    frame = frame_as_given(frame, T_level_scan)
+    objects = poses_as_given(objects, index, frame, T_level_scan)
     return dataclasses.replace(
         scene,
         scans=(*scene.scans, record(index, scan, instances, skipped, frame)),
@@ -157,8 +164,15 @@ def usable(scan: Scan, config: SceneConfig) -> tuple[list[Instance], tuple[Skipp
     return [i for i in scan.instances if len(i.points) >= need], (*scan.skipped, *skipped)
 
 
+def level_for(scan: Scan, config: SceneConfig, first: ScanRecord | None = None) -> Pose:
+    """T_level_scan of a scan whose z is up; else the identity. `first`: of the scene, if it has begun."""
+    if not config.upright:
+        return np.eye(4)
+    return level_of(remembered(scan.background), None if first is None else first.frame.T_scene_scan)
+
+
 def rooms_of(scene: LivingScene, scan: Scan) -> Rooms:
-    """The background of the scan before and of a new one."""
+    """The background of the scan before and of a new one, leveled."""
     last = scene.scans[-1]
     return Rooms(scene=apply_pose(last.frame.T_scene_scan, last.background), scan=scan.background)
 

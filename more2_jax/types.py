@@ -265,7 +265,7 @@ class Scan:
 
 @dataclass(frozen=True, kw_only=True)
 class Frame:
-    """How a scan's frame lies in the scene's, which is that of the first scan."""
+    """How a scan's frame lies in the scene's, which is that of the first scan: upright, leveled."""
 
     T_scene_scan: Float[np.ndarray, "4 4"] = field(default_factory=lambda: np.eye(4))  # float64, row-major
     sigma_m: float = 0.0  # standard errors of what it makes of a place and of a direction; 0 where it was
@@ -274,7 +274,10 @@ class Frame:
 
 @dataclass(frozen=True, kw_only=True)
 class Observation:
-    """One object in one scan. `T_ref_scan` maps the scan's points onto the object's reference observation."""
+    """One object in one scan. `T_ref_scan` maps the scan's points, as given, onto the object's reference observation.
+
+    That of the reference observation itself is the identity, but where its scan was leveled.
+    """
 
     scan: int
     instance: int

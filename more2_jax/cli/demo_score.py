@@ -9,10 +9,11 @@ import trimesh
 from jaxtyping import Float
 from rich.table import Table
 
-from more2_jax.geometry.poses import apply_pose
+from more2_jax.geometry.poses import Pose, apply_pose
 from more2_jax.metrics import chamfer_l1, symmetry_aware_rotation_error_deg
 from more2_jax.scans.demo import DemoTruth, TrueInstance, demo_ground_truth
-from more2_jax.types import LivingScene, Observation, SceneObject
+from more2_jax.tracking.objects import reference_pose
+from more2_jax.types import LivingScene, SceneObject
 
 RIGHT_DEG = 5.0  # a pose is right below this, up to the object's own symmetry
 VERTICAL = np.array([0.0, 0, 1])
@@ -46,8 +47,9 @@ def score_object(o: SceneObject, truth: DemoTruth) -> DemoScore:
     reference, seen = o.observations[0], o.observations[1:]
     mine = truth.at(reference.scan, reference.instance)
     others = [truth.at(s.scan, s.instance) for s in seen]
+    T_scan_ref = np.linalg.inv(reference.T_ref_scan)
     errors = [
-        pose_error(mine, other, s, truth)
+        pose_error(mine, other, T_scan_ref @ s.T_ref_scan, truth)
         for s, other in zip(seen, others, strict=True)
         if other.model == mine.model
     ]
@@ -64,19 +66,19 @@ def score_object(o: SceneObject, truth: DemoTruth) -> DemoScore:
 
 
 def pose_error(
-    reference: TrueInstance, other: TrueInstance, seen: Observation, truth: DemoTruth
+    reference: TrueInstance, other: TrueInstance, T_reference_other: Pose, truth: DemoTruth
 ) -> tuple[float, float]:
-    """Rotation error (degrees, up to the model's symmetry) and error in placing its center (meters)."""
+    """Rotation error (degrees, up to the model's symmetry) and error in placing its center (meters), between scans."""
     T_true = reference.T_scan_model @ np.linalg.inv(other.T_scan_model)
     # In the reference scan's frame the symmetry axis is the model's vertical, turned along.
     rotation_deg = symmetry_aware_rotation_error_deg(
-        seen.T_ref_scan[:3, :3],
+        T_reference_other[:3, :3],
         T_true[:3, :3],
         axis=other.T_scan_model[:3, :3] @ VERTICAL,
         order=truth.symmetry_order[reference.model],
     )
     center = apply_pose(other.T_scan_model, truth.surfaces[reference.model].mean(axis=0, keepdims=True))
-    distance = np.linalg.norm(apply_pose(seen.T_ref_scan, center) - apply_pose(T_true, center))
+    distance = np.linalg.norm(apply_pose(T_reference_other, center) - apply_pose(T_true, center))
     return float(rotation_deg), float(distance)
 
 
@@ -86,7 +88,9 @@ def mesh_error(o: SceneObject, mine: TrueInstance, truth: DemoTruth) -> float:
         return float("nan")
     mesh = trimesh.Trimesh(o.mesh.vertices, o.mesh.faces, process=False)
     points = trimesh.sample.sample_surface(mesh, 10_000, seed=0)[0]
-    surface: Float[np.ndarray, "n 3"] = apply_pose(mine.T_scan_model, truth.surfaces[mine.model])
+    surface: Float[np.ndarray, "n 3"] = apply_pose(
+        reference_pose(o) @ mine.T_scan_model, truth.surfaces[mine.model]
+    )
     return float(chamfer_l1(np.asarray(points), surface))
 
 

@@ -13,11 +13,12 @@ from jaxtyping import Float
 from more2_jax.config import SceneConfig
 from more2_jax.geometry.floor import floor_height
 from more2_jax.geometry.outliers import inliers
+from more2_jax.geometry.poses import apply_pose
 from more2_jax.meshing.extract import HALF_WIDTH, extract_mesh, observed_level
 from more2_jax.meshing.observed_surface import uniform_subsample
 from more2_jax.network.prior import Prior
 from more2_jax.tracking.object_views import seen_from
-from more2_jax.tracking.objects import accumulated, accumulated_points
+from more2_jax.tracking.objects import accumulated, accumulated_points, reference_pose
 from more2_jax.types import Mesh, ScanRecord, SceneObject
 
 # An object stands on another floor than the visible one where more than so many of its points lie clearly below that.
@@ -63,7 +64,7 @@ def object_floor(o: SceneObject, scans: Sequence[ScanRecord], config: SceneConfi
     """
     if not (config.upright and config.meshing.clip_to_floor):
         return None
-    floor = floor_height(scans[o.reference_scan].background)
+    floor = floor_height(apply_pose(reference_pose(o), scans[o.reference_scan].background))
     if floor is None:
         return None
     lowest = float(np.quantile(accumulated_points(o)[:, 2], BELOW_FLOOR_SHARE))

@@ -70,7 +70,8 @@ def fit_one(prior: Prior, seen: Observations, config: JointConfig) -> JointFit:
 
     best, lowest = descend(loss, free, optimizer(config), config.steps)
     # The reference observation defines the frame: all is moved back by what it drifted.
-    drift = jax.tree.map(lambda x: x[0], best["pose"]).inverse()
+    given, found = (jax.tree.map(lambda x: x[0], poses) for poses in (seen.T_ref_obs, best["pose"]))
+    drift = given @ found.inverse()
     code = dataclasses.replace(start, inv=best["inv"], eqv=best["eqv"], center=best["center"])
     poses = jax.vmap(lambda T: drift @ T)(best["pose"])
     fit = JointFit(

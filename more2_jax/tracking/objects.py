@@ -73,6 +73,12 @@ def points_of(o: SceneObject, seen: Observation) -> Points:
     return apply_pose(np.linalg.inv(seen.T_ref_scan), o.points[o.point_scan == seen.scan])
 
 
+def reference_pose(o: SceneObject) -> Pose:
+    """T_ref_scan of the reference scan: the identity, but of a scan that was leveled."""
+    seen = observation_in(o, o.reference_scan)
+    return np.eye(4) if seen is None else seen.T_ref_scan
+
+
 def observation_in(o: SceneObject, scan: int) -> Observation | None:
     """The object's observation in a scan, if it was there."""
     return next((seen for seen in o.observations if seen.scan == scan), None)

@@ -15,7 +15,7 @@ from more2_jax.network.prior import Prior
 from more2_jax.registration.pair_batch import PairBatch, local_batch, pair_up
 from more2_jax.registration.register import register
 from more2_jax.tracking.identify import Found, Identified
-from more2_jax.tracking.objects import accumulated_points, observation_in, place_of, points_of
+from more2_jax.tracking.objects import accumulated_points, observation_in, place_of
 from more2_jax.tracking.scan_frame import settled_frame
 from more2_jax.types import Frame, Instance, Observation, ObservedObject, Registration, SceneObject, Sight
 
@@ -33,7 +33,7 @@ def known_object(o: SceneObject, sight: Sight | None, config: SceneConfig) -> tu
             raise ValueError(
                 f"{o.id} has no observation in its reference scan {o.reference_scan}; needed one"
             )
-        points, T_scene_ref = points_of(o, reference), reference.frame.T_scene_scan
+        points, T_scene_ref = o.points[o.point_scan == reference.scan], place_of(reference)
     own = ObservedObject(points=points, embedding=o.embedding, color=o.color, sight=sight)
     return transform(own, T_scene_ref), np.linalg.inv(T_scene_ref)
 

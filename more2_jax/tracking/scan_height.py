@@ -28,6 +28,7 @@ SPREAD_M = 0.015  # of the votes for a height
 AS_GOOD_VOTES = 0.8  # share of the most votes at which heights that agree are not doubted
 CLEARLY = 3.0  # of log odds over a scene: what a change of height must explain beyond none at all
 LEAST_M = 0.005  # a smaller lift is none
+FLOORS_APART_M = 0.05  # floors at other heights than these are seen apart: the lift between them is then expected
 OUT_OF_REACH_M = 0.1  # an alignment begun at another height finds its own from nearer than this
 
 
@@ -53,6 +54,15 @@ class Weighed:
         pairs = assign(self.odds, np.zeros(self.odds.shape), 0.0)
         return float(self.odds[tuple(pairs.T)].sum())
 
+    @property
+    def matched(self) -> int:
+        """How many pairs that assignment has."""
+        return len(assign(self.odds, np.zeros(self.odds.shape), 0.0))
+
+    def overrules(self, expected: Weighed) -> bool:
+        """Whether this height is believed against the one expected: it explains clearly more, and loses no pair."""
+        return self.explained > expected.explained + CLEARLY and self.matched >= expected.matched
+
 
 def common_height(
     prior: Prior,
@@ -63,27 +73,35 @@ def common_height(
 ) -> Weighed:
     """The lift of a new scan that explains both scans best, and how pairs then fit; upright.
 
-    No lift, unless most tops and bottoms of likely pairs, or the floors, agree on something else and pairs fit
-    clearly better. Pairs are aligned once; again only for a lift too large for an alignment to find from where it was.
+    No lift is expected, or the one between floors that lie clearly apart, if no pair is lost by it. Another (by most tops
+    and bottoms of likely pairs, or by the floors) is taken where it overrules that.
     """
     votes, weights = height_votes(old, new, matcher)
-    heights_m = {best_vote(votes, weights)} if doubtful(votes, weights) else set()
     floors = [floor_height(p) for p in (rooms.scene, rooms.scan)]
-    if floors[0] is not None and floors[1] is not None:
-        heights_m.add(floors[0] - floors[1])
+    between_m = 0.0 if floors[0] is None or floors[1] is None else floors[0] - floors[1]
+    lifts_m = {between_m} | ({best_vote(votes, weights)} if doubtful(votes, weights) else set())
     aligned = align_candidates(prior, old, new, matcher, "upright")
-    best = weighed_at(aligned, matcher, 0.0)
-    for height_m in sorted(h for h in heights_m if abs(h) > LEAST_M):
-        if abs(height_m) > OUT_OF_REACH_M:
-            T = vertical_shift(height_m)
-            aligned_there = align_candidates(prior, old, new, matcher, "upright", T)
-        else:
-            aligned_there = aligned
-        found = settled_height(aligned_there, matcher, height_m)
-        margin = CLEARLY if best.height_m == 0.0 else 0.0
-        if found.explained > best.explained + margin:
-            best = found
-    return best
+    none = weighed_at(aligned, matcher, 0.0)
+    lifted = {m: lifted_by(m, prior, old, new, matcher, aligned) for m in lifts_m if abs(m) > LEAST_M}
+    expected = none
+    if abs(between_m) > FLOORS_APART_M and lifted[between_m].matched >= none.matched:
+        expected = lifted[between_m]
+    others = [x for x in (none, *lifted.values()) if x.overrules(expected)]
+    return max(others, key=lambda x: x.explained, default=expected)
+
+
+def lifted_by(
+    height_m: float,
+    prior: Prior,
+    old: Sequence[ObservedObject],
+    new: Sequence[ObservedObject],
+    matcher: EvidenceMatcher,
+    aligned: AlignedPairs,
+) -> Weighed:
+    """The pairs at a lift; aligned anew for one too large for an alignment to find from where it was."""
+    if abs(height_m) > OUT_OF_REACH_M:
+        aligned = align_candidates(prior, old, new, matcher, "upright", vertical_shift(height_m))
+    return settled_height(aligned, matcher, height_m)
 
 
 def weighed_at(aligned: AlignedPairs, matcher: EvidenceMatcher, height_m: float) -> Weighed:

@@ -1,0 +1,80 @@
+"""Scans of upright things leveled before they are compared; what was found, told of the scans as they were given.
+
+Beyond the paper. Things that turn about the vertical only need one vertical in all scans: by each scan's floors.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+
+from more2_jax.geometry.gravity import gravity
+from more2_jax.geometry.poses import Points, Pose, apply_pose
+from more2_jax.types import Frame, Instance, Observation, Scan, SceneObject
+
+LEAST_TILT_DEG = 0.5  # a smaller tilt is left alone: clean scans stay as they are
+
+
+def level_of(background: Points, T_level_first: Pose | None = None) -> Pose:
+    """T_level_scan: takes a scan to where its floors are level, about the middle of its background.
+
+    The identity where it is level to `LEAST_TILT_DEG`, or up is not known. `T_level_first` is that of the scene's first
+    scan: where it levels this one too, both are taken to share a frame, and go on sharing it.
+    """
+    found = gravity(background)
+    if found is None:
+        return np.eye(4)
+    if T_level_first is not None:
+        there = dataclasses.replace(found, up=T_level_first[:3, :3] @ found.up)
+        if there.tilt_deg < LEAST_TILT_DEG:
+            return T_level_first
+    return np.eye(4) if found.tilt_deg < LEAST_TILT_DEG else found.level(np.median(background, axis=0))
+
+
+def is_level(T_level_scan: Pose) -> bool:
+    """Whether a scan is compared as it was given."""
+    return np.array_equal(T_level_scan, np.eye(4))
+
+
+def leveled(scan: Scan, T_level_scan: Pose) -> Scan:
+    """The scan, leveled: instances, background and sensors."""
+    if is_level(T_level_scan):
+        return scan
+    return dataclasses.replace(
+        scan,
+        instances=tuple(leveled_instance(i, T_level_scan) for i in scan.instances),
+        background=apply_pose(T_level_scan, scan.background),
+        sensors=apply_pose(T_level_scan, scan.sensors),
+    )
+
+
+def leveled_instance(i: Instance, T_level_scan: Pose) -> Instance:
+    """One instance of a leveled scan."""
+    return dataclasses.replace(i, points=apply_pose(T_level_scan, i.points))
+
+
+def frame_as_given(frame: Frame, T_level_scan: Pose) -> Frame:
+    """The frame of a scan as it was given, by that of the leveled one."""
+    if is_level(T_level_scan):
+        return frame
+    return dataclasses.replace(frame, T_scene_scan=frame.T_scene_scan @ T_level_scan)
+
+
+def poses_as_given(
+    objects: Sequence[SceneObject], scan: int, frame: Frame, T_level_scan: Pose
+) -> list[SceneObject]:
+    """The objects with observations in terms of a scan as it was given (`frame`), by those of the leveled one.
+
+    Their points, codes and meshes stay where they are: in the frame of a leveled scan.
+    """
+    if is_level(T_level_scan):
+        return list(objects)
+
+    def told(seen: Observation) -> Observation:
+        if seen.scan != scan:
+            return seen
+        return dataclasses.replace(seen, T_ref_scan=seen.T_ref_scan @ T_level_scan, frame=frame)
+
+    return [dataclasses.replace(o, observations=tuple(told(s) for s in o.observations)) for o in objects]
