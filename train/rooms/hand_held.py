@@ -33,8 +33,8 @@ class Walk:
     """How long a person takes, and how well the device knows where it is."""
 
     views_of_an_object: int = 3  # directions that each object is looked at from, at most
-    views_of_walls: int = 10  # other places looked at, around the room
-    frames_a_view: int = 5  # from one view to the next
+    views_of_walls: int = 12  # other places looked at, around the room
+    frames_a_view: int = 6  # from one view to the next; twice as many where some are then dropped
     most_frames: int = 300
     step_m: float = 0.0035  # drift a frame, standard deviation along each axis
     step_deg: float = 0.1
@@ -81,7 +81,8 @@ def walk(
     Raises ValueError if there is nowhere to stand.
     """
     stops = _stops(targets, taken, room_m, config, blind, rng)
-    frames = min(config.most_frames, config.frames_a_view * (len(stops) - 1) + 1)
+    each = config.frames_a_view if blind is None else 2 * config.frames_a_view
+    frames = min(config.most_frames, each * (len(stops) - 1) + 1)
     at = np.linspace(0, len(stops) - 1, frames)
     first = np.minimum(at.astype(int), len(stops) - 2)
     share = at - first
