@@ -60,7 +60,7 @@ def _numbered(mask: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     ids, count = np.unique(mask, return_counts=True)
     kept = [i for i, n in zip(ids.tolist(), count.tolist(), strict=True) if i > 0 and n >= FEWEST]
     numbers = np.zeros(max(ids.max(), 0) + 1, np.int64)
-    numbers[kept] = rng.permutation(len(kept)) + 1
+    numbers[np.array(kept, np.int64)] = rng.permutation(len(kept)) + 1
     return numbers[np.maximum(mask, 0)]
 
 
