@@ -99,7 +99,9 @@ def sharpest(points: Points) -> Direction:
     return up / np.linalg.norm(up)
 
 
-def slopes_about(slope: Float[np.ndarray, "2"], reach_deg: float, step_deg: float) -> Float[np.ndarray, "k 2"]:
+def slopes_about(
+    slope: Float[np.ndarray, "2"], reach_deg: float, step_deg: float
+) -> Float[np.ndarray, "k 2"]:
     """Slopes (x and y to a z of 1) on a square grid within `reach_deg` of one."""
     steps = np.tan(np.deg2rad(np.arange(-reach_deg, reach_deg + step_deg / 2, step_deg)))
     grid = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)

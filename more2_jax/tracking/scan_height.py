@@ -28,7 +28,9 @@ SPREAD_M = 0.015  # of the votes for a height
 AS_GOOD_VOTES = 0.8  # share of the most votes at which heights that agree are not doubted
 CLEARLY = 3.0  # of log odds over a scene: what a change of height must explain beyond none at all
 LEAST_M = 0.005  # a smaller lift is none
-FLOORS_APART_M = 0.05  # floors at other heights than these are seen apart: the lift between them is then expected
+FLOORS_APART_M = (
+    0.05  # floors at other heights than these are seen apart: the lift between them is then expected
+)
 OUT_OF_REACH_M = 0.1  # an alignment begun at another height finds its own from nearer than this
 
 
