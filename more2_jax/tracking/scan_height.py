@@ -75,8 +75,8 @@ def common_height(
 ) -> Weighed:
     """The lift of a new scan that explains both scans best, and how pairs then fit; upright.
 
-    No lift is expected, or the one between floors that lie clearly apart, if no pair is lost by it. Another (by most tops
-    and bottoms of likely pairs, or by the floors) is taken where it overrules that.
+    Expected is no lift, or the one between floors that lie clearly apart, if no pair is lost by it. Another (by most
+    tops and bottoms of likely pairs, or by the floors) is taken where it overrules that.
     """
     votes, weights = height_votes(old, new, matcher)
     floors = [floor_height(p) for p in (rooms.scene, rooms.scan)]

@@ -151,7 +151,7 @@ def test_where_z_is_not_up_none_is_found(turn_deg):
 
 
 def test_neither_order_nor_place_nor_a_turn_about_z_matters():
-    points, up = tilted(room("plain"), 4.0)
+    points, _ = tilted(room("plain"), 4.0)
     found = gravity(points)
     shuffled = gravity(np.random.default_rng(0).permutation(points))
     shifted = gravity(points + [1000.0, -2000.0, 50.0])
