@@ -271,6 +271,12 @@ class Frame:
     sigma_m: float = 0.0  # standard errors of what it makes of a place and of a direction; 0 where it was
     sigma_deg: float = 0.0  # taken as given
 
+    @property
+    def tilt_deg(self) -> float:
+        """Angle between the scan's z and the scene's: upright, that by which the scan was leveled."""
+        z = self.T_scene_scan[:3, 2]
+        return float(np.rad2deg(np.arctan2(np.hypot(z[0], z[1]), z[2])))
+
 
 @dataclass(frozen=True, kw_only=True)
 class Observation:

@@ -79,6 +79,7 @@ def _build(
                 scene = start_scene(prior, scan, config, progress=session.watch)
             else:
                 scene = add_scan(prior, scene, scan, config, progress=session.watch)
+            _say_level(session, scene)
             _store(session, scene, out, config)
             kept += 1
         if scene is None:
@@ -89,6 +90,14 @@ def _build(
             raise
         how = f"{kept} of {len(scans)} scans are kept in {out}; the same command with --resume goes on"
         raise KeyboardInterrupt(how) from error
+
+
+def _say_level(session: Session, scene: LivingScene) -> None:
+    """By how much the last scan was leveled, if it was."""
+    from more2_jax.report import leveled_text
+
+    if text := leveled_text(scene, scene.scans[-1]):
+        session.say(text)
 
 
 def _stages_of_add(config: SceneConfig) -> int:
@@ -155,6 +164,7 @@ def add(
         keep_compiled_programs()
         prior = _same_prior(scene, prior_name)
         scene = add_scan(prior, scene, scan, config, progress=session.watch)
+        _say_level(session, scene)
         scene = reconstruct(prior, scene, config, progress=session.watch)
         tell(session, scene)
         _save(session, scene, folder, config)

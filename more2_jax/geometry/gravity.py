@@ -23,7 +23,7 @@ LEAST_ON_LEVELS = 0.05  # share of the points that levels must hold together, wa
 LEAST_ON_LEVEL = 0.02  # and each of them
 LEAST_POINTS = 200
 LEAST_WIDTH_M = 0.2  # standard deviation of the levels' points, the narrower way
-STRAY = 0.005  # share of the points cut off at either end of every axis
+REACH_M = 50.0  # along an axis: a stray point a kilometer off must not make a million layers
 TRIED_POINTS = 5000  # at even steps, along the directions tried
 MOST_POINTS = 20_000  # at even steps, for the rest
 
@@ -80,12 +80,11 @@ def least_turn(up: Direction) -> Float[np.ndarray, "3 3"]:
 
 
 def about_middle(points: Points) -> Points:
-    """The points about their median, without what lies far out along an axis."""
+    """The points within `REACH_M` of their median along every axis, about it."""
     if not len(points):
         return points
-    low, high = np.quantile(points, (STRAY, 1 - STRAY), axis=0)
-    kept = points[np.all((points >= low) & (points <= high), axis=1)]
-    return kept - np.median(kept, axis=0) if len(kept) else kept
+    points = points - np.median(points, axis=0)
+    return points[np.abs(points).max(axis=1) <= REACH_M]
 
 
 def sharpest(points: Points) -> Direction:
@@ -100,7 +99,9 @@ def sharpest(points: Points) -> Direction:
     return up / np.linalg.norm(up)
 
 
-def slopes_about(slope: Float[np.ndarray, "2"], reach_deg: float, step_deg: float) -> Float[np.ndarray, "k 2"]:
+def slopes_about(
+    slope: Float[np.ndarray, "2"], reach_deg: float, step_deg: float
+) -> Float[np.ndarray, "k 2"]:
     """Slopes (x and y to a z of 1) on a square grid within `reach_deg` of one."""
     steps = np.tan(np.deg2rad(np.arange(-reach_deg, reach_deg + step_deg / 2, step_deg)))
     grid = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)

@@ -12,6 +12,7 @@ from string import Template
 from more2_jax.config import SceneConfig
 from more2_jax.report.lists import changes_list, object_list, skipped_table, status_counts, timing_table
 from more2_jax.report.payload import payload
+from more2_jax.report.wording import leveled_text
 from more2_jax.types import LivingScene
 
 # In the order in which they need each other; all share one scope.
@@ -82,6 +83,7 @@ def _summary(scene: LivingScene, names: str) -> str:
     return (
         f"{scans} scan{'' if scans == 1 else 's'} ({names}), {objects} object{'' if objects == 1 else 's'} in all; "
         f"preset {scene.preset}, prior {scene.prior}{', upright' if scene.upright else ''}."
+        + "".join(f" {text}." for s in scene.scans if (text := leveled_text(scene, s)))
     )
 
 

@@ -9,7 +9,7 @@ from typing import Literal
 
 from more2_jax.config import SceneConfig
 from more2_jax.tracking.objects import changes_between, motion_between, observation_in
-from more2_jax.types import Changes, LivingScene, Observation, SceneObject
+from more2_jax.types import Changes, LivingScene, Observation, ScanRecord, SceneObject
 
 LOW_SCORE = 0.3  # a match below it is told as unsure; same objects usually score 0.5 to 0.9
 UNLIKELY = 0.6  # as is a change that is less probable than this
@@ -71,6 +71,12 @@ def motion_text(o: SceneObject, changes: Changes) -> str:
     if v.distance_m is None:
         return v.status
     return f"{v.status} {v.distance_m:.2f} m, {v.angle_deg:.1f}°"
+
+
+def leveled_text(scene: LivingScene, scan: ScanRecord) -> str | None:
+    """`friday: leveled by 3.2°`; None of a scan that was taken as given, or in a scene that is not upright."""
+    tilt_deg = scan.frame.tilt_deg
+    return f"{scan.name}: leveled by {tilt_deg:.1f}°" if scene.upright and tilt_deg > 0 else None
 
 
 def phrase(v: Verdict) -> str:

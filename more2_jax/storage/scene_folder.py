@@ -205,6 +205,7 @@ def scene_to_json(scene: LivingScene) -> dict[str, Any]:
                     "T_scene_scan": np.asarray(s.frame.T_scene_scan, np.float64).tolist(),
                     "sigma_m": float(s.frame.sigma_m),
                     "sigma_deg": float(s.frame.sigma_deg),
+                    "tilt_deg": s.frame.tilt_deg,
                 },
             }
             for s in scene.scans

@@ -28,7 +28,9 @@ SPREAD_M = 0.015  # of the votes for a height
 AS_GOOD_VOTES = 0.8  # share of the most votes at which heights that agree are not doubted
 CLEARLY = 3.0  # of log odds over a scene: what a change of height must explain beyond none at all
 LEAST_M = 0.005  # a smaller lift is none
-FLOORS_APART_M = 0.05  # floors at other heights than these are seen apart: the lift between them is then expected
+FLOORS_APART_M = (
+    0.05  # floors at other heights than these are seen apart: the lift between them is then expected
+)
 OUT_OF_REACH_M = 0.1  # an alignment begun at another height finds its own from nearer than this
 
 
@@ -73,8 +75,8 @@ def common_height(
 ) -> Weighed:
     """The lift of a new scan that explains both scans best, and how pairs then fit; upright.
 
-    No lift is expected, or the one between floors that lie clearly apart, if no pair is lost by it. Another (by most tops
-    and bottoms of likely pairs, or by the floors) is taken where it overrules that.
+    Expected is no lift, or the one between floors that lie clearly apart, if no pair is lost by it. Another (by most
+    tops and bottoms of likely pairs, or by the floors) is taken where it overrules that.
     """
     votes, weights = height_votes(old, new, matcher)
     floors = [floor_height(p) for p in (rooms.scene, rooms.scan)]

@@ -40,3 +40,17 @@ def scan(name: str, poses: dict[int, tuple[float, float]]) -> Scan:
         turn = turn_z(angle, np.zeros(3), np.array([x, 0.0, 0.0]))
         instances.append(Instance(id=10 + kind, points=apply_pose(turn, piece(kind)), label=f"kind {kind}"))
     return Scan(name=name, source=name, instances=tuple(instances))
+
+
+def in_frame(s: Scan, T: np.ndarray) -> Scan:
+    """The scan in another frame."""
+    instances = tuple(dataclasses.replace(i, points=apply_pose(T, i.points)) for i in s.instances)
+    return dataclasses.replace(s, instances=instances, background=apply_pose(T, s.background))
+
+
+def room(floor_m: float, seed: int) -> np.ndarray:
+    """Points of a floor and of two walls."""
+    rng = np.random.default_rng(seed)
+    floor, wall = rng.uniform(0, 1, (2, 3000, 3)) * [10, 6, 0], rng.uniform(0, 1, (2, 2000, 3)) * [10, 0, 2.5]
+    other = rng.uniform(0, 1, (2000, 3)) * [0, 6, 2.5]
+    return np.concatenate([floor[0], wall[0], other]) + [-2, -3, floor_m] + rng.normal(0, 0.005, (7000, 3))

@@ -7,10 +7,10 @@ import dataclasses
 import numpy as np
 import pytest
 from factories import turn_z
-from small_scenes import CONFIG, piece, scan
+from small_scenes import CONFIG, in_frame, piece, room, scan
 
 from more2_jax.geometry.floor import floor_height
-from more2_jax.geometry.poses import apply_pose, vertical_shift
+from more2_jax.geometry.poses import vertical_shift
 from more2_jax.network.embedding_batch import embed
 from more2_jax.scene import add_scan, start_scene
 from more2_jax.tracking.objects import motion_between
@@ -20,20 +20,6 @@ from more2_jax.types import Instance, LivingScene, ObservedObject, Scan
 FIRST = {0: (0.0, 0.0), 1: (0.3, 3.0), 2: (0.0, 6.0)}
 THEN = {0: (0.0, 0.0), 1: (1.2, 4.0), 2: (0.0, 6.0)}  # kind 1 moved
 NOTHING = np.zeros((0, 3))
-
-
-def in_frame(s: Scan, T: np.ndarray) -> Scan:
-    """The scan in another frame."""
-    instances = tuple(dataclasses.replace(i, points=apply_pose(T, i.points)) for i in s.instances)
-    return dataclasses.replace(s, instances=instances, background=apply_pose(T, s.background))
-
-
-def room(floor_m: float, seed: int) -> np.ndarray:
-    """Points of a floor and of two walls."""
-    rng = np.random.default_rng(seed)
-    floor, wall = rng.uniform(0, 1, (2, 3000, 3)) * [10, 6, 0], rng.uniform(0, 1, (2, 2000, 3)) * [10, 0, 2.5]
-    other = rng.uniform(0, 1, (2000, 3)) * [0, 6, 2.5]
-    return np.concatenate([floor[0], wall[0], other]) + [-2, -3, floor_m] + rng.normal(0, 0.005, (7000, 3))
 
 
 def visited(prior, second: Scan) -> LivingScene:

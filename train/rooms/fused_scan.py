@@ -27,8 +27,8 @@ class ScanSettings:
 
     sensor: DepthSensor = field(default_factory=DepthSensor)
     walk: Walk = field(default_factory=Walk)
-    voxel_m: tuple[float, float] = (0.024, 0.034)  # of the fusion, least and most
-    kept_faces: tuple[float, float] = (0.35, 0.7)  # share that decimation leaves, least and most
+    voxel_m: tuple[float, float] = (0.02, 0.03)  # of the fusion, least and most
+    kept_faces: tuple[float, float] = (0.4, 0.8)  # share that decimation leaves, least and most
     masks: Masks = "perfect"
 
 

@@ -1,4 +1,4 @@
-"""Depth frames fused into one colored mesh: a truncated signed distance (Curless & Levoy 1996), marching cubes, decimation.
+"""Depth frames fused into one colored mesh: truncated signed distances (Curless & Levoy 1996), then decimation.
 
 Frames are fused where the device believes to be, so its drift is in the mesh.
 """
@@ -149,7 +149,7 @@ def without_crumbs(mesh: ColoredMesh) -> ColoredMesh:
 
 
 def decimated(mesh: ColoredMesh, kept_faces: float) -> ColoredMesh:
-    """Edges collapsed until `kept_faces` (a share) of the faces are left; colors are those of vertices that were there."""
+    """Edges collapsed until `kept_faces` (a share) of the faces are left; vertices keep their colors."""
     if kept_faces >= 1:
         return mesh
     vertices, faces, origin, _ = pcu.decimate_triangle_mesh(

@@ -13,15 +13,19 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from more2_jax.geometry.poses import Pose
 from train.rooms.arrangement import Circle
+from train.rooms.depth_sensor import DepthSensor
 from train.rooms.ray_scanner import camera_matrix, looking
 
 LOWEST_M, HIGHEST_M = 1.15, 1.65  # of the camera
 DISTANCE_M = (1.0, 2.4)  # from what it looks at
 CLEARANCE_M = 0.25  # from walls, and from circles about objects
 TRIES = 60
-SKIPPED_SHARE = (0.2, 0.35)  # of the floor that an incomplete scan never looks at
+# An incomplete scan never looks at a part of the room: the middle of some object lies so far inside, and whatever lies
+# deeper than its edge is out of sight, which is held at these heights over a grid.
+INSIDE_M, EDGE_M, HEIGHTS_M, GRID = (0.4, 0.8), 0.15, (0.05, 0.6), 25
+FEWEST_FRAMES = 30
+AHEAD = 0.4  # of the step from the camera to what it looks at, at most, leads toward that part
 
 
 @dataclass(frozen=True)
@@ -29,8 +33,8 @@ class Walk:
     """How long a person takes, and how well the device knows where it is."""
 
     views_of_an_object: int = 3  # directions that each object is looked at from, at most
-    views_of_walls: int = 10  # other places looked at, around the room
-    frames_a_view: int = 5  # from one view to the next
+    views_of_walls: int = 12  # other places looked at, around the room
+    frames_a_view: int = 6  # from one view to the next; twice as many where some are then dropped
     most_frames: int = 300
     step_m: float = 0.0035  # drift a frame, standard deviation along each axis
     step_deg: float = 0.1
@@ -43,18 +47,25 @@ class Blind:
 
     normal: Float[np.ndarray, " 2"]
     offset_m: float
+    places: Float[np.ndarray, "p 3"]  # all over it, less its edge
 
     def hides(self, places: Float[np.ndarray, "n 2"]) -> np.ndarray:
         """Which places lie in it."""
         return places @ self.normal > self.offset_m
 
 
-def blind_part(room_m: tuple[float, float], rng: np.random.Generator) -> Blind:
-    """A part of the room beyond a random line, `SKIPPED_SHARE` of its floor."""
+def blind_part(
+    targets: Sequence[Float[np.ndarray, " 3"]], room_m: tuple[float, float], rng: np.random.Generator
+) -> Blind:
+    """A part of the room beyond a random line that has at least one of the targets well inside."""
     angle = rng.uniform(0, 2 * np.pi)
     normal = np.array([np.cos(angle), np.sin(angle)])
-    grid = np.stack(np.meshgrid(*(np.linspace(-s / 2, s / 2, 41) for s in room_m)), axis=-1).reshape(-1, 2)
-    return Blind(normal=normal, offset_m=float(np.quantile(grid @ normal, 1 - rng.uniform(*SKIPPED_SHARE))))
+    farthest = max(float(t[:2] @ normal) for t in targets)
+    grid = np.stack(np.meshgrid(*(np.linspace(-s / 2, s / 2, GRID) for s in room_m)), axis=-1).reshape(-1, 2)
+    offset = farthest - rng.uniform(*INSIDE_M)
+    deep = grid[grid @ normal > offset + EDGE_M]
+    places = np.concatenate([np.column_stack([deep, np.full(len(deep), z)]) for z in HEIGHTS_M])
+    return Blind(normal=normal, offset_m=offset, places=places)
 
 
 def walk(
@@ -65,12 +76,13 @@ def walk(
     blind: Blind | None,
     rng: np.random.Generator,
 ) -> Float[np.ndarray, "frames 4 4"]:
-    """T_room_camera of every frame; `targets` (room frame, meters) are the objects' middles, `taken` where not to stand.
+    """T_room_camera of every frame; `targets` (room frame, meters) are objects' middles, `taken` where not to stand.
 
     Raises ValueError if there is nowhere to stand.
     """
     stops = _stops(targets, taken, room_m, config, blind, rng)
-    frames = min(config.most_frames, config.frames_a_view * (len(stops) - 1) + 1)
+    each = config.frames_a_view if blind is None else 2 * config.frames_a_view
+    frames = min(config.most_frames, each * (len(stops) - 1) + 1)
     at = np.linspace(0, len(stops) - 1, frames)
     first = np.minimum(at.astype(int), len(stops) - 2)
     share = at - first
@@ -82,7 +94,7 @@ def walk(
     poses = np.stack([camera_matrix(looking(e, t)) for e, t in zip(eye, target, strict=True)])
     roll = Rotation.from_rotvec([0, 0, 4] * rng.normal(size=(frames, 1)), degrees=True).as_matrix()
     poses[:, :3, :3] = poses[:, :3, :3] @ roll
-    return np.round(poses, 9) if blind is None else _turned_away(np.round(poses, 9), blind)
+    return np.round(poses, 9)
 
 
 def _stops(
@@ -100,12 +112,15 @@ def _stops(
         wanted.append(np.array([*(0.5 * np.array(room_m) * (np.cos(angle), np.sin(angle))), z]))
     if blind is not None:
         wanted = [t for t in wanted if not blind.hides(t[None, :2])[0]]
-    stops = [(_standing(t, taken, room_m, blind, rng), t) for t in wanted]
+    places = [(_standing(t, taken, room_m, blind, rng), t) for t in wanted]
+    stops = [(eye, t) for eye, t in places if eye is not None]
     start = rng.uniform(-np.pi, np.pi)
     around = [(np.arctan2(eye[1], eye[0]) - start) % (2 * np.pi) for eye, _ in stops]
     ordered = [stops[k] for k in np.argsort(around)]
     if len(ordered) < 2:
-        raise ValueError("nothing to look at; needed two places at least")
+        raise ValueError(
+            f"nowhere to stand for a camera in a room of {room_m[0]:.1f} × {room_m[1]:.1f} m; needed more room"
+        )
     return ordered
 
 
@@ -115,18 +130,19 @@ def _standing(
     room_m: tuple[float, float],
     blind: Blind | None,
     rng: np.random.Generator,
-) -> np.ndarray:
-    """A free place to look at a target from. ValueError if there is none."""
+) -> np.ndarray | None:
+    """A free place to look at a target from, not toward the skipped part; None if none is found."""
     half = np.array(room_m) / 2 - CLEARANCE_M
     for k in range(TRIES):
         angle, distance = rng.uniform(0, 2 * np.pi), rng.uniform(*DISTANCE_M) * (1 + k / TRIES)
-        place = target[:2] + distance * np.array([np.cos(angle), np.sin(angle)])
-        inside = (np.abs(place) < half).all() and (blind is None or not blind.hides(place[None])[0])
+        step = distance * np.array([np.cos(angle), np.sin(angle)])
+        place = target[:2] - step
+        inside = (np.abs(place) < half).all()
+        if blind is not None:
+            inside &= not blind.hides(place[None])[0] and step @ blind.normal < AHEAD * distance
         if inside and all(np.hypot(place[0] - x, place[1] - y) > r for x, y, r in taken):
             return np.array([*place, rng.uniform(LOWEST_M, HIGHEST_M)])
-    raise ValueError(
-        f"nowhere to stand for a camera in a room of {room_m[0]:.1f} × {room_m[1]:.1f} m; needed more room"
-    )
+    return None
 
 
 def _clear(
@@ -144,11 +160,15 @@ def _clear(
     return eye
 
 
-def _turned_away(poses: Float[np.ndarray, "f 4 4"], blind: Blind) -> Float[np.ndarray, "f 4 4"]:
-    """The frames that do not look into the skipped part: what lies two meters ahead of the camera is outside it."""
-    ahead = poses[:, :2, 3] + 2.0 * poses[:, :2, 2]
-    kept = ~blind.hides(ahead) & ~blind.hides(poses[:, :2, 3])
-    return poses[kept] if kept.sum() > 10 else poses
+def turned_away(
+    poses: Float[np.ndarray, "f 4 4"], blind: Blind, sensor: DepthSensor
+) -> Float[np.ndarray, "f 4 4"]:
+    """The frames that have nothing of the skipped part, less its edge, in their field; all if there are none."""
+    kept = []
+    for T in poses:
+        local = (blind.places - T[:3, 3]) @ T[:3, :3]
+        kept.append(not (sensor.pixel(local)[1] & (local[:, 2] < sensor.farthest_m)).any())
+    return poses[np.array(kept)] if sum(kept) >= FEWEST_FRAMES else poses
 
 
 def drifted(

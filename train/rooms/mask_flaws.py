@@ -42,7 +42,7 @@ def predicted_masks(
     flaws: Mapping[int, Flaw],
     rng: np.random.Generator,
 ) -> Int[np.ndarray, " v"]:
-    """The instance of every point (from 1, in any order; 0 for none), of the object that each is labeled with (−1: none).
+    """The instance of every point (from 1, in any order; 0: none), of the label that each has (−1: none).
 
     Objects are dirtied before any is cut, split or merged, so that no one's damage repairs another's. Instances of
     fewer than `FEWEST` points are none.
@@ -60,7 +60,7 @@ def _numbered(mask: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     ids, count = np.unique(mask, return_counts=True)
     kept = [i for i, n in zip(ids.tolist(), count.tolist(), strict=True) if i > 0 and n >= FEWEST]
     numbers = np.zeros(max(ids.max(), 0) + 1, np.int64)
-    numbers[kept] = rng.permutation(len(kept)) + 1
+    numbers[np.array(kept, np.int64)] = rng.permutation(len(kept)) + 1
     return numbers[np.maximum(mask, 0)]
 
 
@@ -79,7 +79,7 @@ def _dirty(points: np.ndarray, mask: np.ndarray, own: int, rng: np.random.Genera
     distance = KDTree(points[mine]).query(points[others], distance_upper_bound=REACH_M)[0]
     near, distance = others[np.isfinite(distance)], distance[np.isfinite(distance)]
     share = rng.uniform(*FOREIGN)
-    wanted = int(round(share / (1 - share) * len(mine)))
+    wanted = round(share / (1 - share) * len(mine))
     middle = points[rng.choice(mine)]
     order = np.argsort(distance + 0.2 * np.linalg.norm(points[near] - middle, axis=1), kind="stable")
     return _changed(mask, near[order[:wanted]], own)

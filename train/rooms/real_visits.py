@@ -16,7 +16,7 @@ from train.rooms.coloring import face_colors, model_colors, palette
 from train.rooms.frames import Frames, scan_frames
 from train.rooms.furnishing import furnish
 from train.rooms.fused_scan import FusedScan, ScanSettings, fused_scan, take_frames
-from train.rooms.hand_held import blind_part, walk
+from train.rooms.hand_held import blind_part, turned_away, walk
 from train.rooms.mask_flaws import FEWEST
 from train.rooms.mask_truth import Shown, shown_by
 from train.rooms.ray_scanner import PlacedMesh, Pose, footprint_radius
@@ -181,14 +181,15 @@ class Place:
         self, present: Mapping[str, np.ndarray], poses: Mapping[str, Pose], rng: np.random.Generator
     ) -> np.ndarray:
         """A walk that looks at every object, but for those in the part that one scan in four skips."""
-        blind = blind_part(self.room_m, rng) if rng.random() < SKIPPING else None
         standing = {n: _placed(v, poses[n]) for n, v in present.items()}
         targets = [(v.min(axis=0) + v.max(axis=0)) / 2 for v in standing.values()]
+        blind = blind_part(targets, self.room_m, rng) if rng.random() < SKIPPING else None
         taken: list[Circle] = []
         for n, v in present.items():
             x, y, r = circle(v, poses[n], self.config.free)
             taken.append((x, y, r + 0.1 if standing[n][:, 2].max() > TALL_M else 0.7 * r))
-        return walk(targets, taken, self.room_m, self.config.scanned.walk, blind, rng)
+        path = walk(targets, taken, self.room_m, self.config.scanned.walk, blind, rng)
+        return path if blind is None else turned_away(path, blind, self.config.scanned.sensor)
 
 
 def _placed(points: np.ndarray, pose: Pose) -> np.ndarray:

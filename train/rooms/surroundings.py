@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 import trimesh
 from jaxtyping import Float, Int
+from numpy.typing import ArrayLike
 
 from train.rooms.arrangement import Circle
 from train.rooms.ray_scanner import free_spot
@@ -33,7 +34,7 @@ class Shape:
     color: Float[np.ndarray, " 3"]
 
 
-def box(low: Sequence[float], high: Sequence[float], color: Sequence[float]) -> Shape:
+def box(low: Sequence[float], high: Sequence[float], color: ArrayLike) -> Shape:
     """An axis-aligned box between two corners."""
     made = trimesh.creation.box(bounds=np.array([low, high]))
     return Shape(vertices=np.asarray(made.vertices), faces=np.asarray(made.faces), color=np.asarray(color))
@@ -99,7 +100,7 @@ def _on_walls(room_m: tuple[float, float], rng: np.random.Generator) -> list[Sha
 def loose_clutter(
     room_m: tuple[float, float], taken: Sequence[Circle], rng: np.random.Generator
 ) -> list[Shape]:
-    """Boxes and round things on the floor, clear of what is `taken`: other ones at every visit, fewer if there is no room."""
+    """Boxes and round things on the floor, clear of what is `taken`: other ones at every visit."""
     shapes, occupied = [], list(taken)
     for _ in range(int(rng.integers(ON_FLOOR[0], ON_FLOOR[1] + 1))):
         size, turn = rng.uniform(SMALLEST_M, LARGEST_M, 3), float(rng.uniform(0, np.pi))

@@ -1,0 +1,184 @@
+"""Tilted scans: what is said of level ones is said of them, in terms of the scans as they were given."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from factories import turn_z
+from scipy.spatial.transform import Rotation
+from small_scenes import CONFIG, in_frame, room, scan
+
+from more2_jax.config import preset
+from more2_jax.geometry.poses import apply_pose
+from more2_jax.meshing.object_mesh import object_floor
+from more2_jax.scene import add_scan, level_for, start_scene
+from more2_jax.tracking import leveling
+from more2_jax.tracking.leveling import LEAST_TILT_DEG, frame_as_given, level_of, leveled, poses_as_given
+from more2_jax.tracking.objects import place_of, points_of
+from more2_jax.tracking.relocalize import known_object
+from more2_jax.types import Frame, LivingScene, Scan
+
+FIRST = {0: (0.0, 0.0), 1: (0.3, 3.0), 2: (0.0, 6.0)}
+THEN = {0: (0.0, 0.0), 1: (1.2, 4.0), 2: (0.0, 6.0)}  # kind 1 moved
+NOTHING = np.zeros((0, 3))
+SAME = np.eye(4)
+
+
+def visit(name: str, poses: dict, seed: int) -> Scan:
+    return dataclasses.replace(scan(name, poses), background=room(-0.5, seed))
+
+
+A, B = visit("a", FIRST, 0), visit("b", THEN, 1)
+
+
+def tilt(s: Scan, angle_deg: float, about_deg: float) -> np.ndarray:
+    """T_tilted_scan: a turn about a level axis through the middle of the scan's background."""
+    axis = [np.cos(np.deg2rad(about_deg)), np.sin(np.deg2rad(about_deg)), 0.0]
+    middle = np.median(s.background, axis=0)
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_rotvec(angle_deg * np.array(axis), degrees=True).as_matrix()
+    T[:3, 3] = middle - T[:3, :3] @ middle
+    return T
+
+
+def visited(prior, first: Scan, second: Scan) -> LivingScene:
+    return add_scan(prior, start_scene(prior, first, CONFIG), second, CONFIG)
+
+
+@pytest.fixture(scope="module")
+def level_scene(tiny_prior):
+    """Both scans level, in one frame."""
+    return visited(tiny_prior, A, B)
+
+
+@pytest.fixture(scope="module")
+def tilts():
+    return tilt(A, 5.0, 20.0), tilt(B, 5.0, 160.0)
+
+
+@pytest.fixture(scope="module")
+def tilted_scene(tiny_prior, tilts):
+    """The same scans, each tilted by 5° another way."""
+    return visited(tiny_prior, in_frame(A, tilts[0]), in_frame(B, tilts[1]))
+
+
+def relative(scene: LivingScene) -> list[np.ndarray]:
+    """T_first_second of every object seen twice, between the scans as they were given."""
+    pairs = [o.observations for o in scene.objects if len(o.observations) == 2]
+    return [np.linalg.inv(a.T_ref_scan) @ b.T_ref_scan for a, b in pairs]
+
+
+def said(scene: LivingScene) -> list:
+    changes = [dataclasses.replace(c, probability={}) for c in scene.changes]
+    return [*changes, *[[(s.scan, s.instance) for s in o.observations] for o in scene.objects]]
+
+
+def assert_same_but_for(T_first: np.ndarray, T_second: np.ndarray, found: LivingScene, level: LivingScene):
+    """The same matches and changes; poses differ by the motions of the scans, to 0.2° and 1 cm."""
+    assert said(found) == said(level)
+    for T, expected in zip(relative(found), relative(level), strict=True):
+        T = np.linalg.inv(T_first) @ T @ T_second
+        np.testing.assert_allclose(T[:3, :3], expected[:3, :3], atol=np.deg2rad(0.2))
+        np.testing.assert_allclose(T[:3, 3], expected[:3, 3], atol=0.01)
+
+
+def test_scans_tilted_each_another_way_are_compared_as_if_level(tilted_scene, level_scene, tilts):
+    assert level_scene.changes[0].moved == ("object_001",)
+    assert_same_but_for(*tilts, tilted_scene, level_scene)
+    for s, T in zip(tilted_scene.scans, tilts, strict=True):
+        np.testing.assert_allclose(s.frame.T_scene_scan @ T, np.eye(4), atol=0.01)
+        assert s.frame.tilt_deg == pytest.approx(5.0, abs=0.05)
+
+
+@pytest.mark.parametrize("which", [0, pytest.param(1, marks=pytest.mark.slow)])
+def test_one_tilted_scan_is_compared_as_if_it_were_not(tiny_prior, level_scene, tilts, which):
+    T = [SAME, SAME]
+    T[which] = tilts[which]
+    found = visited(tiny_prior, in_frame(A, T[0]), in_frame(B, T[1]))
+    assert_same_but_for(*T, found, level_scene)
+    assert found.scans[1 - which].frame.tilt_deg == 0.0
+
+
+def test_scans_that_share_a_tilted_frame_go_on_sharing_it(tiny_prior, level_scene, tilts):
+    T = tilts[0]
+    found = visited(tiny_prior, in_frame(A, T), in_frame(B, T))
+    assert_same_but_for(T, T, found, level_scene)
+    first, second = (s.frame.T_scene_scan for s in found.scans)
+    np.testing.assert_array_equal(first, second)
+
+
+def test_points_lie_level_and_single_observations_are_had_back_as_given(tilted_scene, tilts):
+    for o in tilted_scene.objects:
+        for seen, s, T in zip(o.observations, (A, B), tilts, strict=True):
+            given = next(i for i in s.instances if i.id == seen.instance)
+            np.testing.assert_allclose(points_of(o, seen), apply_pose(T, given.points), atol=1e-9)
+            assert seen.frame is tilted_scene.scans[seen.scan].frame
+        reference = o.observations[0]
+        np.testing.assert_array_equal(reference.T_ref_scan, tilted_scene.scans[0].frame.T_scene_scan)
+        np.testing.assert_allclose(place_of(reference), np.eye(4), atol=1e-9)
+
+
+@pytest.mark.parametrize("accumulate", [True, False])
+def test_a_later_scan_is_compared_with_what_lies_level(tilted_scene, accumulate):
+    config = dataclasses.replace(CONFIG, accumulate_target=accumulate)
+    o = tilted_scene.objects[0]
+    known, T_ref_scene = known_object(o, None, config)
+    chosen = o.points if accumulate else o.points[o.point_scan == 0]
+    np.testing.assert_allclose(apply_pose(T_ref_scene, known.points), chosen, atol=1e-9)
+    first = o.observations[0]
+    there = place_of(o.observations[-1] if accumulate else first)
+    np.testing.assert_allclose(known.points, apply_pose(there, chosen), atol=1e-9)
+
+
+def test_the_floor_under_an_object_of_a_tilted_scan_is_level_where_its_points_are(tilted_scene):
+    config = preset("robust", upright=True)
+    for o in tilted_scene.objects:
+        assert object_floor(o, tilted_scene.scans, config) == pytest.approx(-0.5, abs=0.01)
+
+
+def test_level_scans_are_compared_to_the_last_bit_as_without_leveling(monkeypatch, tiny_prior, level_scene):
+    monkeypatch.setattr(leveling, "gravity", lambda _: None)
+    plain = visited(tiny_prior, A, B)
+    for mine, its in zip(level_scene.objects, plain.objects, strict=True):
+        np.testing.assert_array_equal(mine.points, its.points)
+        for a, b in zip(mine.observations, its.observations, strict=True):
+            np.testing.assert_array_equal(a.T_ref_scan, b.T_ref_scan)
+            assert (a.score, a.rms_m, a.misfit) == (b.score, b.rms_m, b.misfit)
+
+
+@pytest.mark.parametrize("angle_deg", [0.0, 0.8 * LEAST_TILT_DEG])
+def test_a_scan_that_is_level_is_left_alone(angle_deg):
+    s = in_frame(A, tilt(A, angle_deg, 40.0))
+    T = level_of(s.background)
+    np.testing.assert_array_equal(T, np.eye(4))
+    assert leveled(s, T) is s
+    frame, objects = Frame(), []
+    assert frame_as_given(frame, T) is frame
+    assert poses_as_given(objects, 0, frame, T) == objects
+
+
+def test_without_a_floor_or_in_any_orientation_nothing_is_leveled():
+    s = in_frame(A, tilt(A, 5.0, 40.0))
+    bare = dataclasses.replace(s, background=NOTHING)
+    free = dataclasses.replace(CONFIG, upright=False)
+    for one, config in ((bare, CONFIG), (s, free)):
+        np.testing.assert_array_equal(level_for(one, config), np.eye(4))
+    assert not np.array_equal(level_for(s, CONFIG), np.eye(4))
+
+
+def test_what_the_first_scans_leveling_does_not_level_is_leveled_by_its_own_floor():
+    first = level_of(apply_pose(tilt(A, 5.0, 0.0), A.background))
+    other = apply_pose(tilt(B, 5.0, 90.0), B.background)
+    T = level_of(other, first)
+    assert not np.array_equal(T, first)
+    np.testing.assert_allclose(T @ tilt(B, 5.0, 90.0), np.eye(4), atol=0.01)
+    same = apply_pose(tilt(A, 5.0, 0.0), B.background)
+    assert level_of(same, first) is first
+
+
+def test_a_leveled_scan_turned_about_the_vertical_keeps_its_tilt():
+    T = turn_z(1.0, np.zeros(3), np.ones(3)) @ tilt(A, 7.0, 30.0)
+    assert Frame(T_scene_scan=T).tilt_deg == pytest.approx(7.0)
+    assert Frame().tilt_deg == Frame(T_scene_scan=turn_z(1.0, np.zeros(3), np.ones(3))).tilt_deg == 0.0
