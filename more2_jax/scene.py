@@ -18,12 +18,13 @@ from more2_jax.network.prior import Prior
 from more2_jax.progress import Watcher, staged
 from more2_jax.refinement.joint_of_objects import embed_accumulated, fit_objects
 from more2_jax.refinement.pose_graph_of_objects import refine_object_poses
+from more2_jax.tracking.changes import changes_between, not_seen_in
 from more2_jax.tracking.identify import identify
 from more2_jax.tracking.leveling import frame_as_given, level_of, leveled, poses_as_given
+from more2_jax.tracking.looked_at import not_looked_at
 from more2_jax.tracking.object_views import few_sensors, instance_sights, object_sights
 from more2_jax.tracking.objects import (
     SCENE_FRAME,
-    changes_between,
     new_object,
     seen_again,
 )
@@ -89,17 +90,25 @@ def add_scan(
         with stage("encode", len(found)):
             changed = [f.object for f, s in zip(found, seen, strict=True) if s.accumulated]
             objects = embed_accumulated(prior, objects, changed)
+    missing = sorted(set(range(len(objects))) - {f.object for f in found})
+    unseen = [
+        objects[k].id for k in not_looked_at(objects, missing, level, frame.T_scene_scan, config.upright)
+    ]
     matched = {f.instance for f in found}
     for i in (i for i in range(len(instances)) if i not in matched):
         objects.append(new_object(len(objects), index, instances[i], embeddings[i], frame))
         chance |= {objects[-1].id: identified.new[i]} if i in identified.new else {}
     frame = frame_as_given(frame, T_level_scan)
     objects = poses_as_given(objects, index, frame, T_level_scan)
+    scans = (*scene.scans, record(index, scan, instances, skipped, frame, unseen))
     return dataclasses.replace(
         scene,
-        scans=(*scene.scans, record(index, scan, instances, skipped, frame)),
+        scans=scans,
         objects=tuple(objects),
-        changes=(*scene.changes, changes_between(objects, index - 1, index, config, chance)),
+        changes=(
+            *scene.changes,
+            changes_between(objects, index - 1, index, config, chance, not_seen_in(scans)),
+        ),
         timing_s=timing,
     )
 
@@ -129,7 +138,8 @@ def reconstruct(
             objects[k] = dataclasses.replace(objects[k], mesh=mesh)
             advance(done)
     changes = tuple(
-        changes_between(objects, c.from_scan, c.to_scan, config, c.probability) for c in scene.changes
+        changes_between(objects, c.from_scan, c.to_scan, config, c.probability, not_seen_in(scene.scans))
+        for c in scene.changes
     )
     return dataclasses.replace(scene, objects=tuple(objects), changes=changes, timing_s=timing)
 
@@ -183,6 +193,7 @@ def record(
     instances: list[Instance],
     skipped: tuple[Skipped, ...],
     frame: Frame = SCENE_FRAME,
+    unseen: Sequence[str] = (),
 ) -> ScanRecord:
     """What the scene remembers of a scan."""
     return ScanRecord(
@@ -191,6 +202,7 @@ def record(
         source=scan.source,
         instances=tuple(i.id for i in instances),
         skipped=skipped,
+        not_seen=tuple(unseen),
         frame=frame,
         background=remembered(scan.background),
         sensors=few_sensors(scan),

@@ -329,6 +329,7 @@ class Changes:
     static: tuple[str, ...] = ()
     added: tuple[str, ...] = ()
     removed: tuple[str, ...] = ()
+    not_seen: tuple[str, ...] = ()  # known before; the later scan did not look where they last stood
     probability: dict[str, float] = field(default_factory=dict)  # of what is said of an object, where known
 
 
@@ -341,6 +342,7 @@ class ScanRecord:
     source: str
     instances: tuple[int, ...]
     skipped: tuple[Skipped, ...] = ()
+    not_seen: tuple[str, ...] = ()  # ids of objects known then, and missing, whose place it did not look at
     frame: Frame = field(default_factory=Frame, compare=False)
     background: Float[np.ndarray, "b 3"] = field(  # thinned, to look at; meters, in the scan's frame, float64
         default_factory=lambda: np.zeros((0, 3)), compare=False, repr=False

@@ -8,14 +8,15 @@ from dataclasses import dataclass
 from typing import Literal
 
 from more2_jax.config import SceneConfig
-from more2_jax.tracking.objects import changes_between, motion_between, observation_in
+from more2_jax.tracking.changes import changes_between, not_seen_in
+from more2_jax.tracking.objects import motion_between, observation_in
 from more2_jax.types import Changes, LivingScene, Observation, ScanRecord, SceneObject
 
 LOW_SCORE = 0.3  # a match below it is told as unsure; same objects usually score 0.5 to 0.9
 UNLIKELY = 0.6  # as is a change that is less probable than this
 
-Status = Literal["moved", "static", "added", "removed", "present", "absent"]
-STATES: tuple[Status, ...] = ("moved", "added", "removed", "static")
+Status = Literal["moved", "static", "added", "removed", "not_seen", "present", "absent"]
+STATES: tuple[Status, ...] = ("moved", "added", "removed", "static", "not_seen")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,7 +32,7 @@ class Verdict:
 def changes_from(scene: LivingScene, a: int, b: int, config: SceneConfig) -> Changes:
     """The changes between scans `a` and `b`: those of the scene where it has them, else worked out."""
     known = next((c for c in scene.changes if (c.from_scan, c.to_scan) == (a, b)), None)
-    return known or changes_between(scene.objects, a, b, config)
+    return known or changes_between(scene.objects, a, b, config, not_seen=not_seen_in(scene.scans))
 
 
 def verdict(o: SceneObject, changes: Changes) -> Verdict:
@@ -45,6 +46,8 @@ def verdict(o: SceneObject, changes: Changes) -> Verdict:
     chance = changes.probability.get(o.id, 1.0)
     if told and chance < UNLIKELY:
         doubts += (f"{status} with a probability of {chance:.0%} only",)
+    if before is None and status in ("moved", "static"):  # the scan before did not look for it
+        before = max((s for s in o.observations if s.scan < changes.from_scan), key=lambda s: s.scan)
     if before is None or after is None:
         return Verdict(status=status, doubts=doubts)
     distance_m, angle_deg = motion_between(o, before, after)
@@ -69,7 +72,7 @@ def motion_text(o: SceneObject, changes: Changes) -> str:
     """What happened to the object between two scans: `moved 2.00 m, 90.0°`, `static`, … or `absent`."""
     v = verdict(o, changes)
     if v.distance_m is None:
-        return v.status
+        return v.status.replace("_", " ")
     return f"{v.status} {v.distance_m:.2f} m, {v.angle_deg:.1f}°"
 
 
@@ -87,6 +90,7 @@ def phrase(v: Verdict) -> str:
         "static": "stayed where it was",
         "added": "added",
         "removed": "removed",
+        "not_seen": "not seen: the scan did not look where it stood",
         "present": "here",
         "absent": "not here",
     }
@@ -114,6 +118,7 @@ def headline(scene: LivingScene, verdicts: Sequence[Verdict], a: int, b: int) ->
         ("added", "was added", "were added"),
         ("removed", "was removed", "were removed"),
         ("static", "stayed", "stayed"),
+        ("not_seen", "was not seen", "were not seen"),
     ):
         if n := counts[status]:
             parts.append(f"{_objects(n) if first else n} {one if n == 1 else more}")

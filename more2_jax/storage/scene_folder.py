@@ -200,6 +200,7 @@ def scene_to_json(scene: LivingScene) -> dict[str, Any]:
                 "source": s.source,
                 "instances": [int(i) for i in s.instances],
                 "skipped": [{"what": k.what, "reason": k.reason} for k in s.skipped],
+                "not_seen": list(s.not_seen),
                 "sensors": np.asarray(s.sensors, np.float64).tolist(),
                 "frame": {
                     "T_scene_scan": np.asarray(s.frame.T_scene_scan, np.float64).tolist(),
@@ -219,6 +220,7 @@ def scene_to_json(scene: LivingScene) -> dict[str, Any]:
                 "static": list(c.static),
                 "added": list(c.added),
                 "removed": list(c.removed),
+                "not_seen": list(c.not_seen),
                 "probability": {k: float(p) for k, p in c.probability.items()},
             }
             for c in scene.changes
@@ -282,6 +284,7 @@ def _scene(folder: Path, content: dict[str, Any]) -> LivingScene:
         s
         | {
             "instances": tuple(s["instances"]),
+            "not_seen": tuple(s.get("not_seen", ())),
             "skipped": tuple(Skipped(**k) for k in s.get("skipped", [])),
             "background": background[owner == s["index"]],
             "frame": _frame(s.get("frame")),
@@ -302,6 +305,7 @@ def _scene(folder: Path, content: dict[str, Any]) -> LivingScene:
                 from_scan=c["from"],
                 to_scan=c["to"],
                 **{k: tuple(c[k]) for k in kinds},
+                not_seen=tuple(c.get("not_seen", ())),
                 probability=c.get("probability", {}),
             )
             for c in content["changes"]

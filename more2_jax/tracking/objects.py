@@ -3,20 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
 
 import numpy as np
-from scipy.special import ndtr
 
-from more2_jax.config import SceneConfig
 from more2_jax.geometry.poses import Points, Pose, apply_pose, rotation_error_deg
 from more2_jax.matching.color import color_of, pooled
-from more2_jax.types import Changes, Embedding, Frame, Instance, Observation, SceneObject
+from more2_jax.types import Embedding, Frame, Instance, Observation, SceneObject
 
-# Registration takes correspondences as independent: true errors are larger than it says, by about this much.
-OPTIMISM = 3.0
 SCENE_FRAME = Frame()  # that of the first scan
-SURE = 2.0  # standard errors that a motion must exceed
 
 
 def new_object(
@@ -95,50 +89,3 @@ def motion_between(o: SceneObject, before: Observation, after: Observation) -> t
     center = accumulated_points(o).mean(axis=0, keepdims=True)
     distance = float(np.linalg.norm(apply_pose(then, center) - apply_pose(first, center)))
     return distance, float(rotation_error_deg(then[:3, :3], first[:3, :3]))
-
-
-def changes_between(
-    objects: Sequence[SceneObject],
-    a: int,
-    b: int,
-    config: SceneConfig,
-    chance: Mapping[str, float] | None = None,
-) -> Changes:
-    """What moved, stayed, came (also: came back) and went between two scans.
-
-    `chance`: probabilities, by object, that what came or went did. Those of motion are worked out here.
-    """
-    found: dict[str, list[str]] = {"moved": [], "static": [], "added": [], "removed": []}
-    probability: dict[str, float] = {}
-    for o in objects:
-        before, after = observation_in(o, a), observation_in(o, b)
-        if before and after:
-            moved = moved_probability(o, before, after, config)
-            found["moved" if moved > 0.5 else "static"].append(o.id)
-            probability[o.id] = max(moved, 1 - moved)
-        elif before or after:
-            found["removed" if before else "added"].append(o.id)
-            if chance and o.id in chance:
-                probability[o.id] = chance[o.id]
-    lists = {k: tuple(v) for k, v in found.items()}
-    return Changes(from_scan=a, to_scan=b, **lists, probability=probability)
-
-
-def moved_probability(o: SceneObject, before: Observation, after: Observation, config: SceneConfig) -> float:
-    """That an object moved: by more than `static_m` or `static_deg`, and than registration's own error explains.
-
-    Measured motions are taken as normal about the true ones. Without an error (`paper`), 0 or 1.
-    """
-    distance, angle_deg = motion_between(o, before, after)
-    found = []
-    for motion, limit, own in (
-        (distance, config.static_m, "sigma_m"),
-        (angle_deg, config.static_deg, "sigma_deg"),
-    ):
-        frames = [getattr(seen.frame, own) for seen in (before, after)]
-        error = float(
-            np.hypot(OPTIMISM * np.hypot(getattr(before, own), getattr(after, own)), np.hypot(*frames))
-        )
-        limit = max(limit, SURE * error)
-        found.append(float(ndtr((motion - limit) / error)) if error > 0 else float(motion > limit))
-    return max(found)

@@ -223,7 +223,7 @@ def test_colors_belong_to_models_and_light_to_scans(rng):
     assert (painted[low] == two[1]).all() and (painted[~low] == two[0]).all()
     gray, up = np.full((500, 3), 0.5), np.tile([0.0, 0, 1], (500, 1))
     one, other = (Light.drawn(rng).developed(gray, up, rng) for _ in range(2))
-    assert 0 <= min(one.min(), other.min()) and max(one.max(), other.max()) <= 1
+    assert min(one.min(), other.min()) >= 0 and max(one.max(), other.max()) <= 1
     assert np.abs(one.mean(axis=0) - other.mean(axis=0)).max() > 0.01
 
 

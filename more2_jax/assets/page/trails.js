@@ -8,14 +8,14 @@ function buildTrails(builds, from, to, pair, extent) {
   const trails = new THREE.Group();
   for (const [k, built] of builds.entries()) {
     const { status, distance_m: distance, angle_deg: angle } = pair.verdicts[k];
-    const left = status === "moved" || status === "removed";
+    const left = ["moved", "removed", "not_seen"].includes(status);
     built.ghost.visible = left && from !== to;
     built.trail = null;
     if (!built.ghost.visible) continue;
-    const start = vectorsOf(seenIn(built.object, from));
+    const start = vectorsOf(lastSeen(built.object, from));
     built.ghost.position.copy(start.position);
     built.ghost.quaternion.copy(start.quaternion);
-    if (status === "removed") continue;
+    if (status !== "moved") continue;
     const width = extent * 0.0035;
     const radius = radiusOf(built);
     if (distance > 0.25 * radius) trails.add(arrow(pathOf(built, from, to, extent), width, built));
@@ -24,11 +24,17 @@ function buildTrails(builds, from, to, pair, extent) {
   return trails;
 }
 
+/** Where an object was at a scan, or before it where that scan did not look. */
+function lastSeen(object, scan) {
+  for (let k = scan; k > 0; k--) if (seenIn(object, k)) return seenIn(object, k);
+  return seenIn(object, 0);
+}
+
 /** An arch from top to top over every scan in between: furniture does not hide it. */
 function pathOf(built, from, to, extent) {
   const stops = [];
   for (let scan = from; scan <= to; scan++) {
-    const seen = seenIn(built.object, scan);
+    const seen = scan === from ? lastSeen(built.object, from) : seenIn(built.object, scan);
     if (seen) stops.push(new THREE.Vector3(0, 0, 1.03 * built.top).add(vectorsOf(seen).position));
   }
   const points = [stops[0]];

@@ -1,0 +1,87 @@
+"""What became of every object between two scans: it moved, stayed, came, went, or was not looked at."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+
+import numpy as np
+from scipy.special import ndtr
+
+from more2_jax.config import SceneConfig
+from more2_jax.tracking.objects import motion_between, observation_in
+from more2_jax.types import Changes, Observation, ScanRecord, SceneObject
+
+# Registration takes correspondences as independent: true errors are larger than it says, by about this much.
+OPTIMISM = 3.0
+SURE = 2.0  # standard errors that a motion must exceed
+
+NotSeen = Mapping[
+    int, Collection[str]
+]  # of a scan, the ids of missing objects whose place it did not look at
+
+
+def changes_between(
+    objects: Sequence[SceneObject],
+    a: int,
+    b: int,
+    config: SceneConfig,
+    chance: Mapping[str, float] | None = None,
+    not_seen: NotSeen | None = None,
+) -> Changes:
+    """What moved, stayed, came (also: came back), went, and was not seen between two scans.
+
+    `chance`: probabilities, by object, that what came or went did. Those of motion are worked out here. An object
+    that scan `a` did not look for is compared with the scan that did.
+    """
+    found: dict[str, list[str]] = {"moved": [], "static": [], "added": [], "removed": [], "not_seen": []}
+    probability: dict[str, float] = {}
+    not_seen = not_seen or {}
+    for o in objects:
+        before, after = last_known(o, a, not_seen), observation_in(o, b)
+        if before and after:
+            moved = moved_probability(o, before, after, config)
+            found["moved" if moved > 0.5 else "static"].append(o.id)
+            probability[o.id] = max(moved, 1 - moved)
+        elif before and o.id in not_seen.get(b, ()):
+            found["not_seen"].append(o.id)
+        elif before or after:
+            found["removed" if before else "added"].append(o.id)
+            if chance and o.id in chance:
+                probability[o.id] = chance[o.id]
+    lists = {k: tuple(v) for k, v in found.items()}
+    return Changes(from_scan=a, to_scan=b, **lists, probability=probability)
+
+
+def not_seen_in(scans: Sequence[ScanRecord]) -> NotSeen:
+    """Of every scan, the objects that it did not look for."""
+    return {s.index: s.not_seen for s in scans}
+
+
+def last_known(o: SceneObject, scan: int, not_seen: NotSeen) -> Observation | None:
+    """The observation that says where an object is at a scan: its own, or one before if none has looked since.
+
+    None where the object was not there, or not known yet.
+    """
+    while scan > 0 and observation_in(o, scan) is None and o.id in not_seen.get(scan, ()):
+        scan -= 1
+    return observation_in(o, scan)
+
+
+def moved_probability(o: SceneObject, before: Observation, after: Observation, config: SceneConfig) -> float:
+    """That an object moved: by more than `static_m` or `static_deg`, and than registration's own error explains.
+
+    Measured motions are taken as normal about the true ones. Without an error (`paper`), 0 or 1.
+    """
+    distance, angle_deg = motion_between(o, before, after)
+    found = []
+    for motion, limit, own in (
+        (distance, config.static_m, "sigma_m"),
+        (angle_deg, config.static_deg, "sigma_deg"),
+    ):
+        frames = [getattr(seen.frame, own) for seen in (before, after)]
+        error = float(
+            np.hypot(OPTIMISM * np.hypot(getattr(before, own), getattr(after, own)), np.hypot(*frames))
+        )
+        limit = max(limit, SURE * error)
+        found.append(float(ndtr((motion - limit) / error)) if error > 0 else float(motion > limit))
+    return max(found)

@@ -1,0 +1,61 @@
+"""Whether a scan looked at the place of an object: "removed" is said only of what was looked for.
+
+A scan that saw a place has points there: of the object, of what stands there instead, or of the floor under it. Beyond
+the paper, which takes every scan to be complete.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.spatial import KDTree
+
+from more2_jax.geometry.poses import Points, apply_pose
+from more2_jax.tracking.objects import accumulated_points, place_of
+from more2_jax.types import Scan, SceneObject
+
+CELL_M = 0.15  # a side of a column of the place: scans hold a point every few centimeters
+ABOVE_M = 0.1  # over an object's top: points higher than that tell nothing of its place
+LOOKED_AT = 0.35  # share of the place that a scan must have looked at to miss the object
+LEAST_BACKGROUND = 200  # points: a scan of objects alone does not tell where it looked
+
+
+def not_looked_at(
+    objects: Sequence[SceneObject],
+    missing: Sequence[int],
+    scan: Scan,
+    T_scene_scan: Float[np.ndarray, "4 4"],
+    upright: bool,
+) -> list[int]:
+    """Those of the `missing` objects whose last place the scan did not look at; none where it has no background."""
+    if len(scan.background) < LEAST_BACKGROUND:
+        return []
+    room = apply_pose(T_scene_scan, np.concatenate([scan.background, *(i.points for i in scan.instances)]))
+    share = looked_at_upright if upright else looked_at
+    return [k for k in missing if share(last_place(objects[k]), room) < LOOKED_AT]
+
+
+def last_place(o: SceneObject) -> Points:
+    """The object's points where it was seen last, in the scene's frame."""
+    return apply_pose(place_of(o.observations[-1]), accumulated_points(o))
+
+
+def looked_at_upright(place: Points, room: Points) -> float:
+    """Share of the columns under a place (z up) that hold points of the scan, none of them over its top."""
+    below = room[room[:, 2] < place[:, 2].max() + ABOVE_M]
+    wanted, seen = (np.unique(_columns(p), axis=0) for p in (place, below))
+    both = np.concatenate([wanted, seen])
+    return (len(both) - len(np.unique(both, axis=0))) / len(wanted)
+
+
+def _columns(points: Points) -> Int[np.ndarray, "n 2"]:
+    return np.floor(points[:, :2] / CELL_M).astype(np.int64)
+
+
+def looked_at(place: Points, room: Points) -> float:
+    """Share of a place's points with a point of the scan nearer than its radius."""
+    radius = float(np.sqrt(((place - place.mean(axis=0)) ** 2).sum(axis=1).mean()))
+    distance, _ = KDTree(room).query(place, distance_upper_bound=radius)
+    return float(np.isfinite(distance).mean())

@@ -1,0 +1,114 @@
+"""Removed, or not seen: a scan that shows neither an object nor the floor under it did not look."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from more2_jax.config import preset
+from more2_jax.geometry.poses import apply_pose
+from more2_jax.tracking.changes import changes_between, last_known, not_seen_in
+from more2_jax.tracking.looked_at import LOOKED_AT, looked_at, looked_at_upright, not_looked_at
+from more2_jax.tracking.objects import new_object, seen_again
+from more2_jax.types import Embedding, Frame, Instance, Observation, Scan, ScanRecord
+
+RNG = np.random.default_rng(0)
+CODE = Embedding(
+    inv=np.ones(2), eqv=np.ones((3, 2)), scale=np.ones(()), center=np.zeros(3), origin=np.zeros(3)
+)
+CONFIG = preset("robust", upright=True)
+BOX = RNG.uniform([-0.4, -0.3, 0.0], [0.4, 0.3, 0.8], (500, 3)) + [2.0, 1.0, 0.0]
+
+
+def floor(low, high, height=0.0, count=4000):
+    points = RNG.uniform([*low, 0.0], [*high, 0.0], (count, 3))
+    return points + [0.0, 0.0, height]
+
+
+def scan(background, *clouds):
+    instances = tuple(Instance(id=k + 1, points=c) for k, c in enumerate(clouds))
+    return Scan(name="later", source="", instances=instances, background=background)
+
+
+def place(T=None):
+    """A box, seen in scan 0, whose scan lies in the scene's frame as `T` says."""
+    return new_object(0, 0, Instance(id=1, points=BOX), CODE, Frame() if T is None else Frame(T_scene_scan=T))
+
+
+def missed(background, *clouds, T=None, upright=True, o=None):
+    T = np.eye(4) if T is None else T
+    return not_looked_at([o or place()], [0], scan(background, *clouds), T, upright)
+
+
+@pytest.mark.parametrize("upright", [True, False])
+def test_bare_floor_where_it_stood_says_removed_and_none_says_not_seen(upright):
+    assert missed(floor([0, 0], [4, 3]), upright=upright) == []
+    assert missed(floor([-4, 0], [1.4, 3]), upright=upright) == [0]
+
+
+def test_half_a_place_is_enough_and_a_corner_of_it_is_not():
+    for share, said in ((0.6, []), (0.2, [0])):
+        edge = 1.6 + 0.8 * share
+        assert missed(floor([-4, 0], [edge, 3])) == said
+    assert 0.2 < LOOKED_AT < 0.6
+
+
+def test_what_stands_there_instead_was_looked_at():
+    other = BOX @ np.diag([0.8, 0.8, 1.2]) + [0.4, 0.2, 0.0]
+    far = floor([-4, 0], [1, 3])
+    assert missed(far, other) == []
+    assert missed(far) == [0]
+
+
+def test_a_ceiling_or_a_lamp_over_the_place_tells_nothing():
+    assert missed(np.concatenate([floor([-4, 0], [1, 3]), floor([0, 0], [4, 3], 2.5)])) == [0]
+
+
+def test_a_scan_without_background_cannot_tell():
+    assert missed(np.zeros((0, 3))) == []
+
+
+def test_it_is_the_scans_place_in_the_scene_that_counts():
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = [[0, -1, 0], [1, 0, 0], [0, 0, 1]], [1.0, 2.0, 0.3]
+    there = floor([1, 0], [3, 2])
+    assert missed(apply_pose(np.linalg.inv(T), there), T=T) == []
+    assert missed(there, T=T) == [0]
+
+
+def test_the_last_place_is_looked_for_not_the_first():
+    moved = np.eye(4)
+    moved[0, 3] = 10.0  # the second scan saw it ten meters on
+    seen = Observation(
+        scan=1, instance=1, T_ref_scan=np.linalg.inv(moved), score=1.0, rms_m=0.0, converged=True
+    )
+    o = seen_again(place(), Instance(id=1, points=apply_pose(moved, BOX)), seen)
+    assert missed(floor([0, 0], [4, 3]), o=o) == [0]
+    assert missed(floor([10, 0], [14, 3]), o=o) == []
+
+
+def test_shares_are_of_the_place():
+    whole = floor([0, 0], [4, 3])
+    assert looked_at_upright(BOX, whole) == 1.0 == looked_at(BOX, BOX + 0.01)
+    assert looked_at_upright(BOX, whole + [50, 0, 0]) == 0.0 == looked_at(BOX, whole + [50, 0, 0])
+
+
+def test_an_object_not_looked_for_is_compared_with_the_scan_that_saw_it_last():
+    pose = np.eye(4)
+    pose[0, 3] = -1.0
+    back = Observation(scan=2, instance=4, T_ref_scan=pose, score=1.0, rms_m=0.0, converged=True)
+    o = seen_again(place(), Instance(id=4, points=BOX + [1.0, 0, 0]), back)
+    records = [
+        ScanRecord(index=k, name="", source="", instances=(), not_seen=(o.id,) if k == 1 else ())
+        for k in range(4)
+    ]
+    seen = not_seen_in(records)
+    assert changes_between([o], 0, 1, CONFIG, not_seen=seen).not_seen == (o.id,)
+    assert changes_between([o], 1, 2, CONFIG, not_seen=seen).moved == (o.id,)
+    assert changes_between([o], 2, 3, CONFIG, not_seen=seen).removed == (o.id,)
+    assert last_known(o, 1, seen) is o.observations[0]
+    nothing = changes_between([o], 0, 1, CONFIG), changes_between([o], 1, 2, CONFIG)
+    assert nothing[0].removed == nothing[1].added == (o.id,)
+    young = dataclasses.replace(o, observations=o.observations[1:], reference_scan=2)
+    assert last_known(young, 1, seen) is None
