@@ -13,9 +13,9 @@ from small_scenes import CONFIG, in_frame, room, scan
 from more2_jax.config import preset
 from more2_jax.geometry.poses import apply_pose
 from more2_jax.meshing.object_mesh import object_floor
-from more2_jax.scene import add_scan, level_for, start_scene
+from more2_jax.scene import add_scan, leveled_scan, start_scene
 from more2_jax.tracking import leveling
-from more2_jax.tracking.leveling import LEAST_TILT_DEG, frame_as_given, level_of, leveled, poses_as_given
+from more2_jax.tracking.leveling import LEAST_TILT_DEG, as_given, level_of, leveled
 from more2_jax.tracking.objects import place_of, points_of
 from more2_jax.tracking.relocalize import known_object
 from more2_jax.types import Frame, LivingScene, Scan
@@ -156,9 +156,8 @@ def test_a_scan_that_is_level_is_left_alone(angle_deg):
     T = level_of(s.background)
     np.testing.assert_array_equal(T, np.eye(4))
     assert leveled(s, T) is s
-    frame, objects = Frame(), []
-    assert frame_as_given(frame, T) is frame
-    assert poses_as_given(objects, 0, frame, T) == objects
+    frame = Frame()
+    assert as_given([], 0, frame, T)[1] is frame
 
 
 def test_without_a_floor_or_in_any_orientation_nothing_is_leveled():
@@ -166,8 +165,10 @@ def test_without_a_floor_or_in_any_orientation_nothing_is_leveled():
     bare = dataclasses.replace(s, background=NOTHING)
     free = dataclasses.replace(CONFIG, upright=False)
     for one, config in ((bare, CONFIG), (s, free)):
-        np.testing.assert_array_equal(level_for(one, config), np.eye(4))
-    assert not np.array_equal(level_for(s, CONFIG), np.eye(4))
+        found, T = leveled_scan(one, config)
+        assert found is one
+        np.testing.assert_array_equal(T, np.eye(4))
+    assert leveled_scan(s, CONFIG)[0] is not s
 
 
 def test_what_the_first_scans_leveling_does_not_level_is_leveled_by_its_own_floor():
