@@ -20,7 +20,7 @@ from more2_jax.refinement.joint_of_objects import embed_accumulated, fit_objects
 from more2_jax.refinement.pose_graph_of_objects import refine_object_poses
 from more2_jax.tracking.changes import changes_between, not_seen_in
 from more2_jax.tracking.identify import identify
-from more2_jax.tracking.leveling import frame_as_given, level_of, leveled, poses_as_given
+from more2_jax.tracking.leveling import as_given, level_of, leveled
 from more2_jax.tracking.looked_at import not_looked_at
 from more2_jax.tracking.object_views import few_sensors, instance_sights, object_sights
 from more2_jax.tracking.objects import (
@@ -42,19 +42,19 @@ def start_scene(
 
     `progress` is told of every stage, here and below.
     """
-    T_level_scan = level_for(scan, config)
-    instances, skipped = usable(leveled(scan, T_level_scan), config)
+    level, T_level_scan = leveled_scan(scan, config)
+    instances, skipped = usable(level, config)
     timing: dict[str, float] = {}
     with staged(timing, progress, "encode", len(instances), scan=scan.name):
         embeddings = embed(prior, [i.points for i in instances])
     objects = [new_object(k, 0, i, e) for k, (i, e) in enumerate(zip(instances, embeddings, strict=True))]
-    frame = frame_as_given(SCENE_FRAME, T_level_scan)
+    objects, frame = as_given(objects, 0, SCENE_FRAME, T_level_scan)
     return LivingScene(
         preset=config.preset,
         prior=prior.name,
         upright=config.upright,
         scans=(record(0, scan, instances, skipped, frame),),
-        objects=tuple(poses_as_given(objects, 0, frame, T_level_scan)),
+        objects=tuple(objects),
         changes=(),
         timing_s=timing,
     )
@@ -68,8 +68,7 @@ def add_scan(
     Objects that were absent for a while can come back. Meshes of objects seen again are dropped; `reconstruct`
     makes them anew. Raises ValueError if the scan has no usable instance.
     """
-    T_level_scan = level_for(scan, config, scene.scans[0])
-    level = leveled(scan, T_level_scan)
+    level, T_level_scan = leveled_scan(scan, config, scene.scans[0])
     instances, skipped = usable(level, config)
     index, timing, objects = len(scene.scans), dict(scene.timing_s), list(scene.objects)
     stage = partial(staged, timing, progress, scan=scan.name)
@@ -91,15 +90,11 @@ def add_scan(
             changed = [f.object for f, s in zip(found, seen, strict=True) if s.accumulated]
             objects = embed_accumulated(prior, objects, changed)
     missing = sorted(set(range(len(objects))) - {f.object for f in found})
-    unseen = [
-        objects[k].id for k in not_looked_at(objects, missing, level, frame.T_scene_scan, config.upright)
-    ]
-    matched = {f.instance for f in found}
-    for i in (i for i in range(len(instances)) if i not in matched):
+    unseen = not_looked_at(objects, missing, level, frame.T_scene_scan, config.upright)
+    for i in sorted(set(range(len(instances))) - {f.instance for f in found}):
         objects.append(new_object(len(objects), index, instances[i], embeddings[i], frame))
         chance |= {objects[-1].id: identified.new[i]} if i in identified.new else {}
-    frame = frame_as_given(frame, T_level_scan)
-    objects = poses_as_given(objects, index, frame, T_level_scan)
+    objects, frame = as_given(objects, index, frame, T_level_scan)
     scans = (*scene.scans, record(index, scan, instances, skipped, frame, unseen))
     return dataclasses.replace(
         scene,
@@ -174,11 +169,13 @@ def usable(scan: Scan, config: SceneConfig) -> tuple[list[Instance], tuple[Skipp
     return [i for i in scan.instances if len(i.points) >= need], (*scan.skipped, *skipped)
 
 
-def level_for(scan: Scan, config: SceneConfig, first: ScanRecord | None = None) -> Pose:
-    """T_level_scan of a scan whose z is up; else the identity. `first`: of the scene, if it has begun."""
+def leveled_scan(scan: Scan, config: SceneConfig, first: ScanRecord | None = None) -> tuple[Scan, Pose]:
+    """The scan, leveled if its z is up, and T_level_scan. `first`: scan of the scene, if it has begun."""
     if not config.upright:
-        return np.eye(4)
-    return level_of(remembered(scan.background), None if first is None else first.frame.T_scene_scan)
+        return scan, np.eye(4)
+    T_level_first = None if first is None else first.frame.T_scene_scan
+    T_level_scan = level_of(remembered(scan.background), T_level_first)
+    return leveled(scan, T_level_scan), T_level_scan
 
 
 def rooms_of(scene: LivingScene, scan: Scan) -> Rooms:

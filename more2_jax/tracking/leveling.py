@@ -55,26 +55,21 @@ def leveled_instance(i: Instance, T_level_scan: Pose) -> Instance:
     return dataclasses.replace(i, points=apply_pose(T_level_scan, i.points))
 
 
-def frame_as_given(frame: Frame, T_level_scan: Pose) -> Frame:
-    """The frame of a scan as it was given, by that of the leveled one."""
-    if is_level(T_level_scan):
-        return frame
-    return dataclasses.replace(frame, T_scene_scan=frame.T_scene_scan @ T_level_scan)
-
-
-def poses_as_given(
+def as_given(
     objects: Sequence[SceneObject], scan: int, frame: Frame, T_level_scan: Pose
-) -> list[SceneObject]:
-    """The objects with observations in terms of a scan as it was given (`frame`), by those of the leveled one.
+) -> tuple[list[SceneObject], Frame]:
+    """Objects and frame in terms of a scan as it was given, by those in terms of the leveled one.
 
-    Their points, codes and meshes stay where they are: in the frame of a leveled scan.
+    Points, codes and meshes stay where they are: in the frame of a leveled scan.
     """
     if is_level(T_level_scan):
-        return list(objects)
+        return list(objects), frame
+    frame = dataclasses.replace(frame, T_scene_scan=frame.T_scene_scan @ T_level_scan)
 
     def told(seen: Observation) -> Observation:
         if seen.scan != scan:
             return seen
         return dataclasses.replace(seen, T_ref_scan=seen.T_ref_scan @ T_level_scan, frame=frame)
 
-    return [dataclasses.replace(o, observations=tuple(told(s) for s in o.observations)) for o in objects]
+    poses = [tuple(told(seen) for seen in o.observations) for o in objects]
+    return [dataclasses.replace(o, observations=p) for o, p in zip(objects, poses, strict=True)], frame

@@ -28,13 +28,13 @@ def not_looked_at(
     scan: Scan,
     T_scene_scan: Float[np.ndarray, "4 4"],
     upright: bool,
-) -> list[int]:
-    """Those of the `missing` objects whose last place the scan did not look at; none where it has no background."""
+) -> tuple[str, ...]:
+    """Ids of those `missing` objects whose last place the scan did not look at; none where it has no background."""
     if len(scan.background) < LEAST_BACKGROUND:
-        return []
+        return ()
     room = apply_pose(T_scene_scan, np.concatenate([scan.background, *(i.points for i in scan.instances)]))
     share = looked_at_upright if upright else looked_at
-    return [k for k in missing if share(last_place(objects[k]), room) < LOOKED_AT]
+    return tuple(objects[k].id for k in missing if share(last_place(objects[k]), room) < LOOKED_AT)
 
 
 def last_place(o: SceneObject) -> Points:

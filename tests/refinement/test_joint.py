@@ -103,6 +103,24 @@ def test_the_reference_stays_where_it_is(fit):
     np.testing.assert_allclose(fit.T_ref_obs.wxyz_xyz[:, 0], still, atol=1e-6)
 
 
+def test_the_reference_stays_where_it_is_given(tiny_prior, seen, unmoved):
+    """Of a scan that was leveled its pose is a tilt about a point; the loss is that of the level scan."""
+    G = jaxlie.SE3.from_rotation_and_translation(
+        jaxlie.SO3.from_x_radians(jnp.float32(0.09)), jnp.array([0.1, -0.3, 0.2], jnp.float32)
+    )
+    tilted = dataclasses.replace(
+        seen,
+        T_ref_obs=jax.vmap(jax.vmap(lambda T: G @ T))(seen.T_ref_obs),
+        accumulated=jax.vmap(lambda code: transform(code, G))(seen.accumulated),
+    )
+    given = np.broadcast_to(G.wxyz_xyz, (OBJECTS, 7))
+    for config in (CONFIG, FROZEN):
+        moved = fit_jointly(tiny_prior, tilted, config)
+        np.testing.assert_allclose(moved.T_ref_obs.wxyz_xyz[:, 0], given, atol=1e-6)
+    np.testing.assert_allclose(moved.loss, unmoved.loss, rtol=1e-4)
+    np.testing.assert_allclose(moved.T_ref_obs.wxyz_xyz, tilted.T_ref_obs.wxyz_xyz, atol=1e-5)
+
+
 def test_without_a_step_size_nothing_moves(seen, unmoved):
     np.testing.assert_allclose(unmoved.T_ref_obs.wxyz_xyz, seen.T_ref_obs.wxyz_xyz, atol=1e-5)
     codes = unmoved.embedding

@@ -15,14 +15,14 @@ from skimage.color import rgb2lab
 
 from more2_jax.config import SceneConfig
 from more2_jax.geometry.poses import apply_pose
-from more2_jax.report import color, motion_text, report_html, rgb, write_report
+from more2_jax.report import color, leveled_text, motion_text, report_html, rgb, write_report
 from more2_jax.report.blob import Blob
 from more2_jax.report.coverage import coverage
 from more2_jax.report.palette import BASE, ink
 from more2_jax.report.payload import payload
 from more2_jax.report.wording import Verdict, headline, phrase, verdict
 from more2_jax.tracking.objects import points_of
-from more2_jax.types import Changes
+from more2_jax.types import Changes, Frame
 
 SCENE, CONFIG = living_scene(), SceneConfig()
 
@@ -164,6 +164,18 @@ def test_doubts_are_told():
     )
     assert "left out of its shape" in doubtful(accumulated=False).doubts[0]
     assert headline(SCENE, [doubtful(score=0.2)], 0, 1).endswith("1 object moved. 1 of these is unsure.")
+
+
+def test_the_tilt_of_a_leveled_scan_is_told():
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_euler("zx", [70.0, 3.21], degrees=True).as_matrix()
+    friday = dataclasses.replace(SCENE.scans[2], frame=Frame(T_scene_scan=T))
+    scene = dataclasses.replace(SCENE, scans=(*SCENE.scans[:2], friday))
+    assert [leveled_text(scene, s) for s in scene.scans] == [None, None, "friday: leveled by 3.2°"]
+    assert "friday: leveled by 3.2°." in report_html(scene, CONFIG)
+    assert "leveled" not in report_html(SCENE, CONFIG)
+    free = dataclasses.replace(scene, upright=False)  # the scans' frames then differ any way
+    assert leveled_text(free, friday) is None
 
 
 def test_the_reference_observation_is_beyond_doubt():

@@ -52,7 +52,10 @@ def test_round_trip_is_exact(tmp_path):
 
 def test_the_frame_of_a_scan_is_that_of_its_observations(tmp_path):
     scene = living_scene()
-    frame = Frame(T_scene_scan=scene.objects[0].observations[-1].T_ref_scan, sigma_m=0.01, sigma_deg=0.2)
+    T = np.eye(4)
+    T[1:3, 1:3] = [[0.0, -1.0], [1.0, 0.0]]  # a quarter turn about x
+    frame = Frame(T_scene_scan=T, sigma_m=0.01, sigma_deg=0.2)
+    assert frame.tilt_deg == 90.0
     scans = (*scene.scans[:2], dataclasses.replace(scene.scans[2], frame=frame))
     objects = tuple(
         dataclasses.replace(
@@ -65,6 +68,10 @@ def test_the_frame_of_a_scan_is_that_of_its_observations(tmp_path):
     again, _ = load_scene(tmp_path / "scene")
     assert_same(scene, again)
     content = json.loads((tmp_path / "scene/scene.json").read_text())
+    tilts = [s["frame"].pop("tilt_deg") for s in content["scans"]]
+    assert tilts == [s.frame.tilt_deg for s in again.scans]
+    (tmp_path / "scene/scene.json").write_text(json.dumps(content))  # as written before tilts were
+    assert_same(scene, load_scene(tmp_path / "scene")[0])
     for s in content["scans"]:
         del s["frame"]  # as written before frames were
     (tmp_path / "scene/scene.json").write_text(json.dumps(content))

@@ -13,9 +13,9 @@ from small_scenes import CONFIG, in_frame, room, scan
 from more2_jax.config import preset
 from more2_jax.geometry.poses import apply_pose
 from more2_jax.meshing.object_mesh import object_floor
-from more2_jax.scene import add_scan, level_for, start_scene
+from more2_jax.scene import add_scan, leveled_scan, start_scene
 from more2_jax.tracking import leveling
-from more2_jax.tracking.leveling import LEAST_TILT_DEG, frame_as_given, level_of, leveled, poses_as_given
+from more2_jax.tracking.leveling import LEAST_TILT_DEG, as_given, level_of, leveled
 from more2_jax.tracking.objects import place_of, points_of
 from more2_jax.tracking.relocalize import known_object
 from more2_jax.types import Frame, LivingScene, Scan
@@ -24,10 +24,11 @@ FIRST = {0: (0.0, 0.0), 1: (0.3, 3.0), 2: (0.0, 6.0)}
 THEN = {0: (0.0, 0.0), 1: (1.2, 4.0), 2: (0.0, 6.0)}  # kind 1 moved
 NOTHING = np.zeros((0, 3))
 SAME = np.eye(4)
+FLOOR_M = -0.75  # below all pieces
 
 
 def visit(name: str, poses: dict, seed: int) -> Scan:
-    return dataclasses.replace(scan(name, poses), background=room(-0.5, seed))
+    return dataclasses.replace(scan(name, poses), background=room(FLOOR_M, seed))
 
 
 A, B = visit("a", FIRST, 0), visit("b", THEN, 1)
@@ -92,7 +93,8 @@ def test_scans_tilted_each_another_way_are_compared_as_if_level(tilted_scene, le
         assert s.frame.tilt_deg == pytest.approx(5.0, abs=0.05)
 
 
-@pytest.mark.parametrize("which", [0, pytest.param(1, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("which", [0, 1])
 def test_one_tilted_scan_is_compared_as_if_it_were_not(tiny_prior, level_scene, tilts, which):
     T = [SAME, SAME]
     T[which] = tilts[which]
@@ -135,7 +137,7 @@ def test_a_later_scan_is_compared_with_what_lies_level(tilted_scene, accumulate)
 def test_the_floor_under_an_object_of_a_tilted_scan_is_level_where_its_points_are(tilted_scene):
     config = preset("robust", upright=True)
     for o in tilted_scene.objects:
-        assert object_floor(o, tilted_scene.scans, config) == pytest.approx(-0.5, abs=0.01)
+        assert object_floor(o, tilted_scene.scans, config) == pytest.approx(FLOOR_M, abs=0.01)
 
 
 def test_level_scans_are_compared_to_the_last_bit_as_without_leveling(monkeypatch, tiny_prior, level_scene):
@@ -154,9 +156,8 @@ def test_a_scan_that_is_level_is_left_alone(angle_deg):
     T = level_of(s.background)
     np.testing.assert_array_equal(T, np.eye(4))
     assert leveled(s, T) is s
-    frame, objects = Frame(), []
-    assert frame_as_given(frame, T) is frame
-    assert poses_as_given(objects, 0, frame, T) == objects
+    frame = Frame()
+    assert as_given([], 0, frame, T)[1] is frame
 
 
 def test_without_a_floor_or_in_any_orientation_nothing_is_leveled():
@@ -164,8 +165,10 @@ def test_without_a_floor_or_in_any_orientation_nothing_is_leveled():
     bare = dataclasses.replace(s, background=NOTHING)
     free = dataclasses.replace(CONFIG, upright=False)
     for one, config in ((bare, CONFIG), (s, free)):
-        np.testing.assert_array_equal(level_for(one, config), np.eye(4))
-    assert not np.array_equal(level_for(s, CONFIG), np.eye(4))
+        found, T = leveled_scan(one, config)
+        assert found is one
+        np.testing.assert_array_equal(T, np.eye(4))
+    assert leveled_scan(s, CONFIG)[0] is not s
 
 
 def test_what_the_first_scans_leveling_does_not_level_is_leveled_by_its_own_floor():

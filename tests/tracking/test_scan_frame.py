@@ -14,7 +14,7 @@ from more2_jax.geometry.poses import vertical_shift
 from more2_jax.network.embedding_batch import embed
 from more2_jax.scene import add_scan, start_scene
 from more2_jax.tracking.objects import motion_between
-from more2_jax.tracking.scan_height import Rooms, best_vote, common_height, doubtful
+from more2_jax.tracking.scan_height import Rooms, Weighed, best_vote, common_height, doubtful
 from more2_jax.types import Instance, LivingScene, ObservedObject, Scan
 
 FIRST = {0: (0.0, 0.0), 1: (0.3, 3.0), 2: (0.0, 6.0)}
@@ -109,6 +109,30 @@ def test_floors_propose_a_height_where_the_objects_do_not_agree(tiny_prior):
     weighed = common_height(tiny_prior, old, new, CONFIG.matching, rooms)
     assert weighed.height_m == pytest.approx(-1.0, abs=0.01)
     assert weighed.odds[0, 0] > 0
+
+
+def test_a_floor_that_was_not_seen_does_not_lift_what_fits_without(tiny_prior):
+    """The second scan shows a table top and no floor: the floors seem 0.7 m apart, and every piece says otherwise."""
+    first = dataclasses.replace(scan("a", FIRST), background=room(0.0, 0))
+    table = np.random.default_rng(0).uniform([0, 0, 0.7], [2, 1, 0.7], (3000, 3))
+    second = dataclasses.replace(scan("b", THEN), background=table)
+    found = add_scan(tiny_prior, start_scene(tiny_prior, first, CONFIG), second, CONFIG)
+    np.testing.assert_array_equal(found.scans[1].frame.T_scene_scan, np.eye(4))
+
+
+@pytest.mark.parametrize(
+    ("odds", "expected", "believed"),
+    [
+        (np.diag([5.0, 5.0, 5.0]), np.diag([5.0, 5.0, 4.0]), False),  # not clearly more
+        (np.diag([5.0, 5.0, 5.0]), np.diag([5.0, 5.0, 1.0]), True),
+        (np.diag([5.0, 5.0, 5.0]), np.diag([5.0, 5.0, -1.0]), True),
+        (np.diag([20.0, -1.0, -1.0]), np.diag([5.0, 5.0, 1.0]), False),  # more, but of fewer pairs
+    ],
+)
+def test_a_height_is_believed_that_explains_clearly_more_and_loses_no_pair(odds, expected, believed):
+    apart = -9.0 * (1 - np.eye(3))
+    one, other = (Weighed(height_m=0.0, aligned=None, odds=x + apart) for x in (odds, expected))
+    assert one.overrules(other) == believed
 
 
 def test_the_floor_is_the_lowest_full_layer():
