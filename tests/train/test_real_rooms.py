@@ -20,8 +20,8 @@ from train import synthesize
 from train.furniture.collections import SourceMesh, write_packed
 from train.rooms import mask_flaws, real_visits
 from train.rooms.depth_sensor import DepthSensor
-from train.rooms.fused_scan import ScanSettings
 from train.rooms.furnishing import MOVED_M, furnish, overlap
+from train.rooms.fused_scan import ScanSettings
 from train.rooms.hand_held import Walk
 from train.rooms.mask_flaws import FOREIGN, LOST, MIX, SMALLER, draw_flaws, predicted_masks
 from train.rooms.mask_truth import Shown, shown_by
@@ -31,9 +31,9 @@ from train.rooms.scene_files import read_scene
 from train.rooms.visits import FlyingScene
 
 QUICK = ScanSettings(
-    sensor=DepthSensor(width=96, height=72),
-    walk=Walk(views_of_an_object=2, views_of_walls=6, frames_a_view=4),
-    voxel_m=(0.035, 0.035),
+    sensor=DepthSensor(width=80, height=60),
+    walk=Walk(views_of_an_object=2, views_of_walls=5, frames_a_view=3),
+    voxel_m=(0.04, 0.04),
     kept_faces=(0.8, 0.8),
 )
 
@@ -53,7 +53,7 @@ MODELS = [chair(f"chair_{k}", 0.4 + 0.06 * k, 0.5, 0.7 + 0.1 * k) for k in range
 
 
 def made(masks: mask_flaws.Masks = "perfect", seed: int = 1, **more) -> RealScene:
-    config = RealConfig(scans=2, scanned=dataclasses.replace(QUICK, masks=masks), **more)
+    config = RealConfig(**{"scans": 2, "scanned": dataclasses.replace(QUICK, masks=masks)} | more)
     return real_scene(MODELS, config, np.random.default_rng(seed), "scene_0000")
 
 
@@ -95,29 +95,18 @@ def test_true_poses_lay_models_onto_the_scan(read, scene):
             np.testing.assert_allclose(upright[:3, 2], [0, 0, 1], atol=1e-8)
 
 
-def test_away_from_borders_every_vertex_has_the_label_of_the_nearest_surface(scene):
-    for scan, shown in zip(scene.scans, scene.shown, strict=True):
-        number = {
-            s.instance: k
-            for k, o in enumerate(o for o in scene.objects if o.name in shown)
-            for s in [shown[o.name]]
-        }
-        tree_labels = np.array([number.get(int(i), -1) for i in range(scan.instance.max() + 1)])
-        border = {int(v) for f in scan.mesh.faces if len(set(scan.owner[f].tolist())) > 1 for v in f}
-        there = [o.name for o in scene.objects if o.name in shown]
-        owner_names = [
-            o.name
-            for o in scene.objects
-            if scan is scene.scans[0]
-            and 0 in o.T_scan_model
-            or scan is scene.scans[1]
-            and 1 in o.T_scan_model
-        ]
-        said = np.array([there[k] if k >= 0 else "" for k in tree_labels[scan.instance]])
-        true = np.array([owner_names[k] if k >= 0 else "" for k in scan.owner])
-        inner = np.array([v not in border for v in range(len(true))])
-        assert (said == true)[inner & (true != "")].mean() > 0.85
-        assert (said == true)[inner].mean() > 0.95
+def test_away_from_borders_masks_agree_with_the_nearest_surface(scene):
+    for k, scan in enumerate(scene.scans):
+        there = [o.name for o in scene.objects if k in o.T_scan_model]
+        owner_of = np.full(scan.instance.max() + 1, -1)
+        for name, shown in scene.shown[k].items():
+            owner_of[shown.instance] = there.index(name)
+        at_border = np.zeros(len(scan.owner), bool)
+        at_border[scan.mesh.faces[np.ptp(scan.owner[scan.mesh.faces], axis=1) > 0]] = True
+        right = owner_of[scan.instance] == scan.owner
+        assert right[~at_border].mean() > 0.95
+        assert right[~at_border & (scan.owner >= 0)].mean() > 0.85
+        assert not right[at_border].all()  # pieces end where they end
 
 
 def test_files_are_what_a_user_has(folder, scene):
@@ -142,12 +131,12 @@ def test_files_are_what_a_user_has(folder, scene):
 def test_a_seed_decides_alone(scene, folder, tmp_path):
     digest = json.loads((folder / "scene.json").read_text())["digest"]
     assert write_real_scene(tmp_path / "again", made(), {"seed": 1}) == digest
-    assert write_real_scene(tmp_path / "other", made(seed=2), {"seed": 1}) != digest
+    assert write_real_scene(tmp_path / "again", made(scans=1), {"seed": 1}) != digest
 
 
 def test_what_is_gone_was_looked_at_and_what_is_skipped_was_not(monkeypatch):
     monkeypatch.setattr(real_visits, "SKIPPING", 1.0)
-    skipped = [made(seed=s) for s in (3, 4)]
+    skipped = [made(seed=s, scans=1) for s in (3, 4)]
     missed = [
         (room, k, o)
         for room in skipped
@@ -156,7 +145,7 @@ def test_what_is_gone_was_looked_at_and_what_is_skipped_was_not(monkeypatch):
         if k in o.T_scan_model and k not in o.instance
     ]
     assert missed
-    assert all(room.looked_at[k][o.name] < 0.5 for room, k, o in missed if k == 0)
+    assert all(room.looked_at[0][o.name] < 0.5 for room, o in missed)
     monkeypatch.setattr(real_visits, "SKIPPING", 0.0)
     monkeypatch.setattr(
         real_visits, "_roles", lambda *_: real_visits.FlyingConfig(scans=2, removed=3, static=2)
@@ -174,16 +163,15 @@ def test_furniture_stands_apart_and_what_moves_moves():
     second = furnish(vertices, first, ["chair_0", "chair_1"], (3.5, 3.2), rng)
     for poses in (first, second):
         boxes = []
-        for n, T in poses.items():
-            below = apply_pose(T, vertices[n])[:, :2]
-            assert (np.abs(below) < np.array([3.5, 3.2]) / 2).all()
-            solid = trimesh.Trimesh(apply_pose(T, vertices[n]), next(m for m in MODELS if m.name == n).faces)
-            boxes.append(solid)
+        for m in MODELS:
+            placed = apply_pose(poses[m.name], vertices[m.name])
+            assert (np.abs(placed[:, :2]) < np.array([3.5, 3.2]) / 2).all()
+            boxes.append(trimesh.Trimesh(placed, m.faces))
         for a, b in itertools.combinations(boxes, 2):
             assert not a.contains(np.asarray(b.sample(200, seed=0))).any()
     moved = {n: np.linalg.norm((first[n] - second[n])[:2, 3]) for n in vertices}
     assert all((d == 0) if n in ("chair_0", "chair_1") else d >= MOVED_M for n, d in moved.items())
-    with pytest.raises(ValueError, match="no place for 5 objects in 1.0 × 1.0 m; needed more room"):
+    with pytest.raises(ValueError, match=r"no place for 5 objects in 1\.0 × 1\.0 m; needed more room"):
         furnish(vertices, {}, [], (1.0, 1.0), rng)
     square = np.array([[0, 0], [1, 0], [1, 1], [0, 1.0]])
     turned = np.array([[1.6, -0.1], [2.3, 0.6], [1.6, 1.3], [0.9, 0.6]])
@@ -223,20 +211,20 @@ def test_flaws_do_what_they_say(seed):
         shown = shown_by(mask, label, 3, 64)
         return mask, shown, shares(mask, label)
 
-    mask, shown, share = masked("perfect")
+    _, shown, share = masked("perfect")
     assert all(s == (1, 0) for s in share.values()) and len(share) == 3
-    mask, shown, share = masked("cut")
+    _, shown, share = masked("cut")
     assert LOST[0] - 0.01 <= 1 - share[shown[1].instance][0] <= LOST[1] + 0.01
     assert share[shown[0].instance] == (1, 0)
-    mask, shown, share = masked("dirty")
+    _, shown, share = masked("dirty")
     assert FOREIGN[0] - 0.01 <= share[shown[1].instance][1] <= FOREIGN[1] + 0.01
     assert share[shown[1].instance][0] == 1
-    mask, shown, share = masked("split")
+    _, shown, share = masked("split")
     assert len(shown[1].instances) == 2
     large, small = (share[i][0] for i in shown[1].instances)
     assert large + small == pytest.approx(1)
     assert SMALLER[0] - 0.01 <= small <= SMALLER[1] + 0.01
-    mask, shown, share = masked("merged")
+    _, shown, share = masked("merged")
     assert len(share) == 2
     (both,) = {s.instance for s in shown.values() if s.merged}
     assert [s.merged for s in shown.values()].count(True) == 1
