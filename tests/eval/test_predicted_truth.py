@@ -79,7 +79,8 @@ def test_a_match_to_a_smaller_part_is_right():
     assert match_scores(scene, 0, 1, matched)["right.paper"] == 4
     assert match_scores(scene, 0, 1, {**matched, 0: 99})["right.paper"] == 4
     assert match_scores(scene, 0, 1, {**matched, 0: 99})["right.strict"] == 4
-    assert match_scores(SCENE, 0, 1, {**matched, 0: 99})["right.paper"] == 3
+    unknown = dataclasses.replace(SCENE, scans=scans)
+    assert match_scores(unknown, 0, 1, {**matched, 0: 99})["right.paper"] == 3
 
 
 def test_a_merged_object_has_failed_for_whoever_keeps_the_mask_whole():
