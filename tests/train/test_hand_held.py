@@ -191,7 +191,7 @@ def test_frames_are_tilted_or_nearly_the_same(rng):
 
 def test_what_lies_behind_a_wall_is_not_in_sight(rng):
     room = bare_room()
-    path = walk([np.array([1.0, 0, 0.5])], [], ROOM_M, Walk(views_of_walls=8), None, rng)
+    path = walk([np.array([1.0, 0, 0.5])], [], ROOM_M, Walk(views_of_walls=30, frames_a_view=2), None, rng)
     frames = take_frames(room, path, SENSOR, rng)
     inside, outside = rng.uniform(-1, 1, (200, 3)) * [1.2, 1.1, 0], rng.uniform(-1, 1, (200, 3))
     inside[:, 2] = rng.uniform(0.1, 0.8, 200)

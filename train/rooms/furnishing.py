@@ -15,6 +15,7 @@ TRIES, PLACES = 60, 200  # arrangements, and places for one object in each
 AT_WALL = 0.55  # share of the objects that stand with a side to a wall
 GAP_M = (0.02, 0.12)  # between such an object and its wall
 APART_M = 0.04  # between any two objects, at least
+FULLEST = 0.7  # share of the floor under boxes about furniture, beyond which nothing is tried
 MOVED_M = 0.3  # what moves comes to stand at least so far from where it was
 
 Corners = Float[np.ndarray, "4 2"]
@@ -32,6 +33,11 @@ def furnish(
     Static objects stay where they were `before`; the others move. Raises ValueError when the room is too full.
     """
     boxes = {n: _footprint(v) for n, v in present.items()}
+    full = ValueError(
+        f"no place for {len(present)} objects in {room_m[0]:.1f} × {room_m[1]:.1f} m; needed more room"
+    )
+    if sum(float(np.ptp(b, axis=0).prod()) for b in boxes.values()) > FULLEST * room_m[0] * room_m[1]:
+        raise full
     largest_first = sorted(present, key=lambda n: -float(np.ptp(boxes[n], axis=0).prod()))
     for _ in range(TRIES):
         poses = {n: before[n] for n in present if n in static and n in before}
@@ -42,9 +48,7 @@ def furnish(
             poses[n] = pose
         else:
             return {n: poses[n] for n in present}
-    raise ValueError(
-        f"no place for {len(present)} objects in {room_m[0]:.1f} × {room_m[1]:.1f} m; needed more room"
-    )
+    raise full
 
 
 def _footprint(vertices: Float[np.ndarray, "v 3"]) -> Corners:

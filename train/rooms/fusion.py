@@ -96,7 +96,7 @@ class Volume:
             part = tuple(slice(c, n - 1 + c) for c, n in zip(corner, self.shape, strict=True))
             whole[1:, 1:, 1:] &= known[part]
         volume = self.distance.reshape(self.shape)
-        vertices, faces, _, _ = marching_cubes(volume, 0.0, mask=whole, gradient_direction="ascent")
+        vertices, faces, _, _ = marching_cubes(volume, 0.0, mask=whole, gradient_direction="descent")
         cell = np.clip(np.round(vertices).astype(np.int64), 0, np.array(self.shape) - 1)
         colors = self.color[np.ravel_multi_index(tuple(cell.T), self.shape)]
         return ColoredMesh(

@@ -36,9 +36,9 @@ class Walk:
     views_of_walls: int = 12  # other places looked at, around the room
     frames_a_view: int = 6  # from one view to the next; twice as many where some are then dropped
     most_frames: int = 300
-    step_m: float = 0.0035  # drift a frame, standard deviation along each axis
-    step_deg: float = 0.1
-    pull: float = 0.08  # share of the drift that is taken back at every frame
+    step_m: float = 0.004  # drift a frame, standard deviation along each axis
+    step_deg: float = 0.12
+    pull: float = 0.06  # share of the drift that is taken back at every frame
 
 
 @dataclass(frozen=True, kw_only=True)

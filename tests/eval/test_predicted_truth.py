@@ -1,0 +1,102 @@
+"""Scores where masks are predicted: parts are the object, what is merged is lost, what is not seen has not gone."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import trimesh
+from known_scenes import known_scene, pose
+
+from eval.data.flyingshape import known
+from eval.data.masks import LOST
+from eval.data.truth import KnownScene
+from eval.scores.match_scores import match_scores
+from eval.scores.tracks import Track, changes_f1, score_tracks
+from train.rooms.visits import TrueObject
+
+TURN = {0: pose(10, [0, 0, 0]), 1: pose(90, [2, 0, 0], "x")}  # T_scan_room of two scans
+
+
+def true_object(**more) -> TrueObject:
+    box = trimesh.creation.box((0.8, 0.5, 0.3))
+    stands = pose(30, [1.0, 2.0, 0.15])
+    return TrueObject(
+        name="object_0",
+        model="box",
+        category="box",
+        vertices=np.asarray(box.vertices),
+        faces=np.asarray(box.faces),
+        T_scan_model={k: T @ stands for k, T in TURN.items()},
+        **{"instance": {0: 3, 1: 5}} | more,
+    )
+
+
+def test_moved_is_told_in_the_room_whatever_the_scans_frames():
+    there = true_object()
+    assert known(there, list(TURN.values())).moved == {0: False, 1: False}
+    moved = {**there.T_scan_model, 1: TURN[1] @ pose(30, [1.0, 2.4, 0.15])}
+    assert known(dataclasses.replace(there, T_scan_model=moved), list(TURN.values())).moved[1]
+
+
+def test_parts_are_the_object_and_merged_ones_are_lost():
+    split = known(true_object(parts={0: (3, 4), 1: (5,)}))
+    assert split.masks(0) == (3, 4)
+    assert split.masks(2) == ()
+    merged = known(true_object(merged=frozenset({1}), parts={0: (3,), 1: (5,)}))
+    assert merged.instance == {0: 3, 1: LOST}
+    scene = KnownScene(name="one", scans=(), objects=(split,))
+    assert [scene.owner(0, i) for i in (3, 4, 5)] == [split, split, None]
+
+
+def with_object(scene: KnownScene, n: int, **changed) -> KnownScene:
+    objects = [dataclasses.replace(o, **changed) if k == n else o for k, o in enumerate(scene.objects)]
+    return dataclasses.replace(scene, objects=tuple(objects))
+
+
+def true_tracks(scene: KnownScene) -> list[Track]:
+    return [
+        Track(
+            instance={k: i for k, i in o.instance.items() if i != LOST},
+            T_track_scan={k: np.linalg.inv(T) for k, T in o.T_scan_model.items()},
+            points=np.zeros((1, 3)),
+        )
+        for o in scene.objects
+    ]
+
+
+SCENE = known_scene(scans=2)
+
+
+def test_a_match_to_a_smaller_part_is_right():
+    parts = {0: (0,), 1: (10, 99)}
+    extra = dataclasses.replace(SCENE.scans[1].instances[0], id=99)
+    scans = (
+        SCENE.scans[0],
+        dataclasses.replace(SCENE.scans[1], instances=(*SCENE.scans[1].instances, extra)),
+    )
+    scene = dataclasses.replace(with_object(SCENE, 0, parts=parts), scans=scans)
+    matched = {k: 10 + k for k in range(4)}
+    assert match_scores(scene, 0, 1, matched)["right.paper"] == 4
+    assert match_scores(scene, 0, 1, {**matched, 0: 99})["right.paper"] == 4
+    assert match_scores(scene, 0, 1, {**matched, 0: 99})["right.strict"] == 4
+    unknown = dataclasses.replace(SCENE, scans=scans)
+    assert match_scores(unknown, 0, 1, {**matched, 0: 99})["right.paper"] == 3
+
+
+def test_a_merged_object_has_failed_for_whoever_keeps_the_mask_whole():
+    scene = with_object(SCENE, 3, instance={0: 3, 1: LOST})
+    records = {r["object"]: r for r in score_tracks(scene, true_tracks(scene), 5.0, 10)}
+    assert [records[f"object_{k}"]["m.strict"] for k in range(4)] == [1, 1, 1, 0]
+    assert "m.published" not in records["object_3"]
+
+
+@pytest.mark.parametrize("absent", [0, 1])
+def test_what_is_not_seen_has_neither_come_nor_gone(absent):
+    seen = {k: i for k, i in SCENE.objects[0].instance.items() if k != absent}
+    unseen = with_object(SCENE, 0, instance=seen)
+    assert changes_f1(unseen, true_tracks(unseen)) == 1  # says that it came, or went; nobody can know
+    poses = {k: T for k, T in SCENE.objects[0].T_scan_model.items() if k != absent}
+    gone = with_object(SCENE, 0, instance=seen, T_scan_model=poses)
+    assert changes_f1(gone, true_tracks(gone)) == 1
+    assert changes_f1(gone, true_tracks(gone)[1:]) == 0
+    assert changes_f1(unseen, true_tracks(unseen)[1:]) == 1
