@@ -174,6 +174,16 @@ def test_furniture_stands_apart_and_what_moves_moves():
     assert overlap(square, turned + [0.2, 0], apart_m=0.2)
 
 
+def test_free_objects_lie_any_way_on_the_floor():
+    room = made(scans=1, free=True)
+    upright = []
+    for o in room.objects:
+        T = np.linalg.inv(room.scans[0].T_scan_room) @ o.T_scan_model[0]
+        assert apply_pose(T, o.vertices)[:, 2].min() == pytest.approx(0, abs=1e-6)
+        upright.append(T[2, 2] > 0.99)
+    assert not all(upright)
+
+
 # --- masks -------------------------------------------------------------------------------------------------
 
 

@@ -24,7 +24,11 @@ from train.rooms.surroundings import Shape, loose_clutter, shell
 from train.rooms.visits import FlyingConfig, Furnished, TrueObject
 from train.rooms.whole_room import WholeRoom, in_sight, seen_of, whole_room
 
-FLOOR_A_CIRCLE = (1.7, 2.8)  # area of the floor over that of the circles about the furniture
+FLOOR_A_CIRCLE = (
+    1.7,
+    2.8,
+)  # area of the floor over that of the circles about the furniture; in any orientation
+FLOOR_FREE = (2.6, 3.6)  # circles are kept apart, not boxes
 SMALLEST_ROOM_M = 3.2
 SKIPPING = 0.25  # of the scans skip a part of the room
 TALL_M = 1.0  # nobody holds a camera over what is higher
@@ -74,7 +78,8 @@ def real_scene(
     Raises ValueError if there is no room for the furniture, or nowhere to stand.
     """
     furnished = Furnished.of(models, _roles(len(models), config, rng), rng)
-    room_m = config.room_m or _room_for([footprint_radius(v) for v in furnished.vertices.values()], rng)
+    radii = [footprint_radius(v) for v in furnished.vertices.values()]
+    room_m = config.room_m or _room_for(radii, FLOOR_FREE if config.free else FLOOR_A_CIRCLE, rng)
     kind: Frames = "own" if rng.random() < 0.5 else "aligned"
     frames = scan_frames(kind, config.scans, rng)
     place = Place(
@@ -108,9 +113,11 @@ def _roles(count: int, config: RealConfig, rng: np.random.Generator) -> FlyingCo
     return FlyingConfig(scans=config.scans, static=static, removed=removed, added=added, free=config.free)
 
 
-def _room_for(radii: Sequence[float], rng: np.random.Generator) -> tuple[float, float]:
-    """A floor with some room between circles of these radii."""
-    area = rng.uniform(*FLOOR_A_CIRCLE) * np.pi * sum(r * r for r in radii)
+def _room_for(
+    radii: Sequence[float], share: tuple[float, float], rng: np.random.Generator
+) -> tuple[float, float]:
+    """A floor so many times (least, most) as large as circles of these radii."""
+    area = rng.uniform(*share) * np.pi * sum(r * r for r in radii)
     least = max(SMALLEST_ROOM_M, 2 * max(radii) + 0.5)
     y = max(least, float(np.sqrt(area * rng.uniform(0.65, 1.0))))
     return round(max(least, area / y), 3), round(y, 3)
