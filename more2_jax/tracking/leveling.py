@@ -20,16 +20,16 @@ LEAST_TILT_DEG = 0.5  # a smaller tilt is left alone: clean scans stay as they a
 def level_of(background: Points, T_level_first: Pose | None = None) -> Pose:
     """T_level_scan: takes a scan to where its floors are level, about the middle of its background.
 
-    The identity where it is level to `LEAST_TILT_DEG`, or up is not known. `T_level_first` is that of the scene's first
-    scan: where it levels this one too, both are taken to share a frame, and go on sharing it.
+    `T_level_first` is that of the scene's first scan. Where it levels this one too, to `LEAST_TILT_DEG`, or up is not
+    known here, both are taken to share a frame, and go on sharing it. Of a first scan it is the identity.
     """
+    T_level_first = np.eye(4) if T_level_first is None else T_level_first
     found = gravity(background)
     if found is None:
-        return np.eye(4)
-    if T_level_first is not None:
-        there = dataclasses.replace(found, up=T_level_first[:3, :3] @ found.up)
-        if there.tilt_deg < LEAST_TILT_DEG:
-            return T_level_first
+        return T_level_first
+    left = dataclasses.replace(found, up=T_level_first[:3, :3] @ found.up)
+    if left.tilt_deg < LEAST_TILT_DEG:
+        return T_level_first
     return np.eye(4) if found.tilt_deg < LEAST_TILT_DEG else found.level(np.median(background, axis=0))
 
 

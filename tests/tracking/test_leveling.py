@@ -179,6 +179,7 @@ def test_what_the_first_scans_leveling_does_not_level_is_leveled_by_its_own_floo
     np.testing.assert_allclose(T @ tilt(B, 5.0, 90.0), np.eye(4), atol=0.01)
     same = apply_pose(tilt(A, 5.0, 0.0), B.background)
     assert level_of(same, first) is first
+    assert level_of(NOTHING, first) is first  # as far as is known they share a frame
 
 
 def test_a_leveled_scan_turned_about_the_vertical_keeps_its_tilt():
