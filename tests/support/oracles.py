@@ -16,7 +16,7 @@ Weights = Mapping[str, np.ndarray]
 
 
 def linear(weight: np.ndarray, x: np.ndarray) -> np.ndarray:
-    return np.einsum("oi,...ix->...ox", weight.astype(np.float64), x)
+    return weight.astype(np.float64) @ x
 
 
 def vnla(weights: Weights, name: str, x: np.ndarray) -> np.ndarray:
