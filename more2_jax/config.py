@@ -211,6 +211,7 @@ class SceneConfig:
     static_m: float = 0.05  # and moved by less, is static
     # Match and register against all seen so far, not the reference observation.
     accumulate_target: bool = False
+    repair_masks: bool = False  # join what masks split, where another scan saw it whole
     accumulate_misfit: float = 1.0  # an observation whose registration fits worse is left out of the shape
     matching: Matcher = field(default_factory=CodeMatcher)
     registration: RegistrationMethod = field(default_factory=DescentRegistration)
@@ -248,6 +249,7 @@ def preset(name: str, *, upright: bool = False) -> SceneConfig:
             upright=upright,
             accumulate_target=True,
             accumulate_misfit=0.5,
+            repair_masks=True,
             matching=EvidenceMatcher(),
             registration=SurfaceRegistration(),
             meshing=ROBUST_MESHING,

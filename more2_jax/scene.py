@@ -18,19 +18,33 @@ from more2_jax.network.prior import Prior
 from more2_jax.progress import Watcher, staged
 from more2_jax.refinement.joint_of_objects import embed_accumulated, fit_objects
 from more2_jax.refinement.pose_graph_of_objects import refine_object_poses
-from more2_jax.tracking.changes import changes_between, not_seen_in
-from more2_jax.tracking.identify import identify
+from more2_jax.tracking.changes import changes_between, forgotten, not_seen_in
+from more2_jax.tracking.identify import Found, identify
 from more2_jax.tracking.leveling import as_given, level_of, leveled
 from more2_jax.tracking.looked_at import not_looked_at
 from more2_jax.tracking.object_views import few_sensors, instance_sights, object_sights
 from more2_jax.tracking.objects import (
     SCENE_FRAME,
     new_object,
+    next_number,
     seen_again,
 )
 from more2_jax.tracking.relocalize import known_object, relocalize
 from more2_jax.tracking.scan_frame import Rooms
-from more2_jax.types import Embedding, Frame, Instance, LivingScene, ObservedObject, Scan, ScanRecord, Skipped
+from more2_jax.tracking.split_masks import Mended, mend_splits
+from more2_jax.types import (
+    Embedding,
+    Frame,
+    Instance,
+    LivingScene,
+    Observation,
+    ObservedObject,
+    Repair,
+    Scan,
+    ScanRecord,
+    SceneObject,
+    Skipped,
+)
 
 BACKGROUND_POINTS = 20_000  # of a scan, remembered for the page and for what its sensors looked through
 
@@ -78,34 +92,57 @@ def add_scan(
         old, new = compared_objects(scene, instances, embeddings, level, config)
         known = [o for o, _ in old]
         identified = identify(prior, known, new, config, rooms_of(scene, level))
-    found, chance = identified.found, {objects[k].id: p for k, p in identified.gone.items()}
+    found, gone = identified.found, {objects[k].id: p for k, p in identified.gone.items()}
     with stage("register", len(found)):
         seen, frame = relocalize(prior, objects, old, instances, new, identified, index, config)
-    for f, observation in zip(found, seen, strict=True):
-        objects[f.object] = seen_again(objects[f.object], instances[f.instance], observation)
-        if isinstance(config.matching, EvidenceMatcher):
-            chance[objects[f.object].id] = f.score  # that what came back is what it was
+    mended = mended_masks(objects, instances, found, seen, config)
+    objects, came_back = with_observations(mended, found, seen, config)
     if config.accumulate_target:
         with stage("encode", len(found)):
             changed = [f.object for f, s in zip(found, seen, strict=True) if s.accumulated]
             objects = embed_accumulated(prior, objects, changed)
-    missing = sorted(set(range(len(objects))) - {f.object for f in found})
+    missing = sorted(set(range(len(objects))) - {f.object for f in found} - mended.object_parts)
     unseen = not_looked_at(objects, missing, level, frame.T_scene_scan, config.upright)
-    for i in sorted(set(range(len(instances))) - {f.instance for f in found}):
-        objects.append(new_object(len(objects), index, instances[i], embeddings[i], frame))
-        chance |= {objects[-1].id: identified.new[i]} if i in identified.new else {}
-    objects, frame = as_given(objects, index, frame, T_level_scan)
-    scans = (*scene.scans, record(index, scan, instances, skipped, frame, unseen))
+    left = sorted(set(range(len(instances))) - {f.instance for f in found} - mended.instance_parts)
+    first = next_number(objects)
+    fresh = [new_object(first + n, index, instances[i], embeddings[i], frame) for n, i in enumerate(left)]
+    come = {o.id: identified.new[i] for o, i in zip(fresh, left, strict=True) if i in identified.new}
+    objects, frame = as_given([*mended.whole(objects), *fresh], index, frame, T_level_scan)
+    scene = forgotten(scene, mended.absorbed)
+    scans = (*scene.scans, record(index, scan, instances, skipped, frame, unseen, mended.repairs))
+    chance = gone | came_back | come
+    changes = changes_between(objects, index - 1, index, config, chance, not_seen_in(scans))
     return dataclasses.replace(
         scene,
         scans=scans,
         objects=tuple(objects),
-        changes=(
-            *scene.changes,
-            changes_between(objects, index - 1, index, config, chance, not_seen_in(scans)),
-        ),
+        changes=(*scene.changes, changes),
         timing_s=timing,
     )
+
+
+def mended_masks(
+    objects: Sequence[SceneObject],
+    instances: Sequence[Instance],
+    found: Sequence[Found],
+    seen: Sequence[Observation],
+    config: SceneConfig,
+) -> Mended:
+    """Instances and objects with their masks repaired, if that is asked for."""
+    if not config.repair_masks:
+        return Mended(instances=list(instances), objects=list(objects))
+    return mend_splits(objects, instances, [(f.object, f.instance) for f in found], seen)
+
+
+def with_observations(
+    mended: Mended, found: Sequence[Found], seen: Sequence[Observation], config: SceneConfig
+) -> tuple[list[SceneObject], dict[str, float]]:
+    """The objects with what the scan saw of them, and (`EvidenceMatcher`) how likely it is that it was they."""
+    objects = list(mended.objects)
+    for f, observation in zip(found, seen, strict=True):
+        objects[f.object] = seen_again(objects[f.object], mended.instances[f.instance], observation)
+    known = isinstance(config.matching, EvidenceMatcher)
+    return objects, {objects[f.object].id: f.score for f in found if known}
 
 
 def reconstruct(
@@ -191,6 +228,7 @@ def record(
     skipped: tuple[Skipped, ...],
     frame: Frame = SCENE_FRAME,
     unseen: Sequence[str] = (),
+    repairs: tuple[Repair, ...] = (),
 ) -> ScanRecord:
     """What the scene remembers of a scan."""
     return ScanRecord(
@@ -200,6 +238,7 @@ def record(
         instances=tuple(i.id for i in instances),
         skipped=skipped,
         not_seen=tuple(unseen),
+        repairs=repairs,
         frame=frame,
         background=remembered(scan.background),
         sensors=few_sensors(scan),

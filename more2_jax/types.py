@@ -334,6 +334,16 @@ class Changes:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Repair:
+    """A mask that was mended on the evidence of another scan."""
+
+    object: str  # id of the whole
+    instances: tuple[int, ...] = ()  # of the scan, that are parts of it, the one that was matched first
+    absorbed: tuple[str, ...] = ()  # ids that parts of it had in the scene before
+    share: float = 1.0  # of the part, that lies on the whole
+
+
+@dataclass(frozen=True, kw_only=True)
 class ScanRecord:
     """What a living scene remembers of a scan."""
 
@@ -343,6 +353,7 @@ class ScanRecord:
     instances: tuple[int, ...]
     skipped: tuple[Skipped, ...] = ()
     not_seen: tuple[str, ...] = ()  # ids of objects known then, and missing, whose place it did not look at
+    repairs: tuple[Repair, ...] = ()  # that it led to
     frame: Frame = field(default_factory=Frame, compare=False)
     background: Float[np.ndarray, "b 3"] = field(  # thinned, to look at; meters, in the scan's frame, float64
         default_factory=lambda: np.zeros((0, 3)), compare=False, repr=False

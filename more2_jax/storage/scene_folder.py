@@ -33,6 +33,7 @@ from more2_jax.types import (
     Frame,
     LivingScene,
     Observation,
+    Repair,
     ScanRecord,
     SceneObject,
     Skipped,
@@ -201,6 +202,7 @@ def scene_to_json(scene: LivingScene) -> dict[str, Any]:
                 "instances": [int(i) for i in s.instances],
                 "skipped": [{"what": k.what, "reason": k.reason} for k in s.skipped],
                 "not_seen": list(s.not_seen),
+                "repairs": [_repair_to_json(r) for r in s.repairs],
                 "sensors": np.asarray(s.sensors, np.float64).tolist(),
                 "frame": {
                     "T_scene_scan": np.asarray(s.frame.T_scene_scan, np.float64).tolist(),
@@ -227,6 +229,11 @@ def scene_to_json(scene: LivingScene) -> dict[str, Any]:
         ],
         "timing_s": {k: float(scene.timing_s.get(k, 0.0)) for k in (*STAGES, *scene.timing_s)},
     }
+
+
+def _repair_to_json(r: Repair) -> dict[str, Any]:
+    lists = {"instances": [int(i) for i in r.instances], "absorbed": list(r.absorbed)}
+    return {"object": r.object, **lists, "share": float(r.share)}
 
 
 def _object_to_json(o: SceneObject) -> dict[str, Any]:
@@ -285,6 +292,7 @@ def _scene(folder: Path, content: dict[str, Any]) -> LivingScene:
         | {
             "instances": tuple(s["instances"]),
             "not_seen": tuple(s.get("not_seen", ())),
+            "repairs": tuple(_repair(r) for r in s.get("repairs", ())),
             "skipped": tuple(Skipped(**k) for k in s.get("skipped", [])),
             "background": background[owner == s["index"]],
             "frame": _frame(s.get("frame")),
@@ -342,6 +350,11 @@ def _embeddings(path: Path) -> dict[str, Embedding]:
         return Embedding(**{k: stacked[k][n] for k in EMBEDDING}, anchors=anchors)
 
     return {str(i): one(n) for n, i in enumerate(stacked["id"])}
+
+
+def _repair(content: dict[str, Any]) -> Repair:
+    lists = {k: tuple(content[k]) for k in ("instances", "absorbed")}
+    return Repair(object=content["object"], **lists, share=content["share"])
 
 
 def _frame(content: dict[str, Any] | None) -> Frame:

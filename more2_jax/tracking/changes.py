@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
@@ -9,7 +10,7 @@ from scipy.special import ndtr
 
 from more2_jax.config import SceneConfig
 from more2_jax.tracking.objects import motion_between, observation_in
-from more2_jax.types import Changes, Observation, ScanRecord, SceneObject
+from more2_jax.types import Changes, LivingScene, Observation, ScanRecord, SceneObject
 
 # Registration takes correspondences as independent: true errors are larger than it says, by about this much.
 OPTIMISM = 3.0
@@ -55,6 +56,27 @@ def changes_between(
 def not_seen_in(scans: Sequence[ScanRecord]) -> NotSeen:
     """Of every scan, the objects that it did not look for."""
     return {s.index: s.not_seen for s in scans}
+
+
+def forgotten(scene: LivingScene, ids: Collection[str]) -> LivingScene:
+    """The scene's history without some objects, which turned out to be parts of others."""
+    if not ids:
+        return scene
+
+    def less(names: tuple[str, ...]) -> tuple[str, ...]:
+        return tuple(n for n in names if n not in ids)
+
+    kinds = ("moved", "static", "added", "removed", "not_seen")
+    changes = tuple(
+        dataclasses.replace(
+            c,
+            **{k: less(getattr(c, k)) for k in kinds},
+            probability={k: p for k, p in c.probability.items() if k not in ids},
+        )
+        for c in scene.changes
+    )
+    scans = tuple(dataclasses.replace(s, not_seen=less(s.not_seen)) for s in scene.scans)
+    return dataclasses.replace(scene, changes=changes, scans=scans)
 
 
 def last_known(o: SceneObject, scan: int, not_seen: NotSeen) -> Observation | None:

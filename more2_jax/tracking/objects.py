@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -36,6 +37,11 @@ def new_object(
         embedding=embedding,
         color=color_of(instance.colors),
     )
+
+
+def next_number(objects: Sequence[SceneObject]) -> int:
+    """One that no object has: ids of objects that were parts of others are gone."""
+    return 1 + max((int(o.id.rpartition("_")[2]) for o in objects), default=-1)
 
 
 def seen_again(o: SceneObject, instance: Instance, seen: Observation) -> SceneObject:

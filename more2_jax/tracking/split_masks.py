@@ -1,0 +1,166 @@
+"""Masks that show one object in pieces: found by the whole that another scan saw, and joined.
+
+Beyond the paper, which takes masks as true. Two instances of one scan that lie on one object in one pose are one
+object: they cannot both be there otherwise.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from more2_jax.geometry.poses import Points, Pose, apply_pose
+from more2_jax.matching.color import pooled
+from more2_jax.tracking.objects import accumulated_points, place_of
+from more2_jax.types import Instance, Observation, Repair, SceneObject
+
+Parts = dict[
+    int, tuple[int, float]
+]  # row of a part → which of those found it is part of, share of it on that
+
+# Chosen on rooms of regime `real`, docs/relocalization.md.
+NEAR = 0.08  # shares of the object's radius: what lies so near its points lies on it
+NEAR_M = 0.03  # and at least so near: what fusion and drift leave of a surface
+LEAST_ON = 0.6  # share of a part that must lie on the whole
+WORST_MISFIT = 0.5  # of the pose by which parts are laid onto the whole
+
+
+@dataclass(frozen=True, kw_only=True)
+class Mended:
+    """Instances and objects with what was split joined. Rows stay where they are; those in the sets are parts."""
+
+    instances: list[Instance]
+    objects: list[SceneObject]
+    instance_parts: frozenset[int] = frozenset()
+    object_parts: frozenset[int] = frozenset()
+    repairs: tuple[Repair, ...] = ()
+
+    @property
+    def absorbed(self) -> frozenset[str]:
+        """Ids of the objects that are parts of others."""
+        return frozenset(id_ for r in self.repairs for id_ in r.absorbed)
+
+    def whole(self, objects: Sequence[SceneObject]) -> list[SceneObject]:
+        """The objects less those that are parts of others."""
+        return [o for row, o in enumerate(objects) if row not in self.object_parts]
+
+
+def mend_splits(
+    objects: Sequence[SceneObject],
+    instances: Sequence[Instance],
+    found: Sequence[tuple[int, int]],
+    seen: Sequence[Observation],
+) -> Mended:
+    """Joins the parts of one object: those in this scan, and those in the scan before.
+
+    `found` names objects and instances by rows, `seen` says where each instance lies on its object.
+    """
+    mended, known, repairs = list(instances), list(objects), list[Repair]()
+    now, then = (parts(objects, instances, found, seen) for parts in (parts_in_scan, parts_known))
+    for n, (k, i) in enumerate(found):
+        rows = [row for row, (whole, _) in now.items() if whole == n]
+        if rows:
+            mended[i] = joined(instances[i], [instances[row] for row in rows])
+            ids = tuple(instances[row].id for row in (i, *rows))
+            share = min(now[row][1] for row in rows)
+            repairs.append(Repair(object=objects[k].id, instances=ids, share=share))
+        for row in (row for row, (whole, _) in then.items() if whole == n):
+            known[k] = absorbed(known[k], objects[row])
+            repairs.append(Repair(object=objects[k].id, absorbed=(objects[row].id,), share=then[row][1]))
+    return Mended(
+        instances=mended,
+        objects=known,
+        instance_parts=frozenset(now),
+        object_parts=frozenset(then),
+        repairs=tuple(repairs),
+    )
+
+
+def parts_in_scan(
+    objects: Sequence[SceneObject],
+    instances: Sequence[Instance],
+    found: Sequence[tuple[int, int]],
+    seen: Sequence[Observation],
+) -> Parts:
+    """Instances left over that are parts of objects found by another one."""
+    left = sorted(set(range(len(instances))) - {i for _, i in found})
+    parts: Parts = {}
+    for n, ((k, _), pose) in enumerate(zip(found, seen, strict=True)):
+        if not trusted(pose):
+            continue
+        whole = accumulated_points(objects[k])
+        for i in left:
+            share = share_on(whole, apply_pose(pose.T_ref_scan, instances[i].points))
+            if share >= max(LEAST_ON, parts.get(i, (0, 0.0))[1]):
+                parts[i] = n, share
+    return parts
+
+
+def parts_known(
+    objects: Sequence[SceneObject],
+    instances: Sequence[Instance],
+    found: Sequence[tuple[int, int]],
+    seen: Sequence[Observation],
+) -> Parts:
+    """Objects not found that are parts of one that was, now seen whole.
+
+    Only those that were seen when the other was, and once: two parts of one mask.
+    """
+    left = sorted(set(range(len(objects))) - {k for k, _ in found})
+    parts: Parts = {}
+    for n, ((k, i), pose) in enumerate(zip(found, seen, strict=True)):
+        last = objects[k].observations[-1]
+        if not trusted(pose):
+            continue
+        whole = apply_pose(place_of(last) @ pose.T_ref_scan, instances[i].points)
+        for q in (q for q in left if [s.scan for s in objects[q].observations] == [last.scan]):
+            there = apply_pose(place_of(objects[q].observations[0]), objects[q].points)
+            share = share_on(whole, there)
+            if share >= max(LEAST_ON, parts.get(q, (0, 0.0))[1]):
+                parts[q] = n, share
+    return parts
+
+
+def trusted(pose: Observation) -> bool:
+    """Whether a pose may say what lies on what."""
+    return pose.converged and pose.misfit <= WORST_MISFIT
+
+
+def share_on(whole: Points, part: Points) -> float:
+    """Share of a part's points on the surface of a whole, both in one frame."""
+    radius = float(np.sqrt(((whole - whole.mean(axis=0)) ** 2).sum(axis=1).mean()))
+    distance, _ = KDTree(whole).query(part, distance_upper_bound=max(NEAR * radius, NEAR_M))
+    return float(np.isfinite(distance).mean())
+
+
+def joined(first: Instance, others: Sequence[Instance]) -> Instance:
+    """Several instances of a scan as one, with the first one's id; what not all of them have is lost."""
+    every = [first, *others]
+
+    def together(parts: list[np.ndarray | None]) -> np.ndarray | None:
+        known = [p for p in parts if p is not None]
+        return np.concatenate(known) if len(known) == len(parts) else None
+
+    return dataclasses.replace(
+        first,
+        points=np.concatenate([i.points for i in every]),
+        colors=together([i.colors for i in every]),
+        normals=together([i.normals for i in every]),
+    )
+
+
+def absorbed(whole: SceneObject, part: SceneObject) -> SceneObject:
+    """The object with what was seen of a part of it, at the place where both stood."""
+    last, own = whole.observations[-1], part.observations[0]
+    T_whole_part: Pose = np.linalg.inv(place_of(last)) @ place_of(own)
+    return dataclasses.replace(
+        whole,
+        points=np.concatenate([whole.points, apply_pose(T_whole_part, part.points)]),
+        point_scan=np.concatenate([whole.point_scan, part.point_scan]),
+        color=pooled(whole.color, part.color),
+        mesh=None,
+    )
