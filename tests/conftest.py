@@ -1,12 +1,14 @@
 """JAX on the CPU in full precision, shapes of every signature checked, and the smallest prior there is."""
 
 import os
+from contextlib import nullcontext
 
 os.environ["JAX_PLATFORMS"] = "cpu"
 
 import jax
 import jaxtyping
 import pytest
+from compiling import quickly
 from jaxtyping import install_import_hook
 from places import ROOT
 
@@ -34,6 +36,13 @@ def tiny_prior():
 
     config = load_config(ROOT / "configs" / "tiny.yaml", TrainingRun).model
     return init_prior(config, jax.random.key(0), "tiny")
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_protocol(item):
+    """Tests marked `quickly` compile so, their fixtures included."""
+    with quickly() if item.get_closest_marker("quickly") else nullcontext():
+        return (yield)
 
 
 @pytest.fixture

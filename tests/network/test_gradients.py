@@ -13,6 +13,7 @@ from compiling import quick_jit
 from more2_jax.network.prior import encode, sdf
 from more2_jax.types import Embedding, PointCloud
 
+pytestmark = pytest.mark.quickly
 REAL = 90, 110  # points of the two clouds; the rest of the rows is padding
 ROWS, QUERIES, STEP = 128, 20, 1e-8
 MASK = np.arange(ROWS) < np.array(REAL)[:, None]

@@ -20,7 +20,7 @@ from more2_jax.types import Anchors
 from train.run.settings import TrainingRun
 
 CHANNELS, BANDWIDTHS, INPUTS = 4, (0.1, 0.3), 6
-encoded, distance = jax.jit(encode_one), jax.jit(sdf_one)
+encoded, distance = quick_jit(encode_one), quick_jit(sdf_one)
 
 
 def random_anchors(count: int, seed: int = 0) -> Anchors:

@@ -36,6 +36,7 @@ def test_checkpoint_that_torch_saved_agrees_with_what_torch_computed():
     assert max(deviation.values()) <= 1e-5, deviation
 
 
+@pytest.mark.quickly
 def test_full_width_checkpoint_agrees_with_the_oracle(tmp_path):
     weights = oracles.random_weights((32, 32, 64, 64, 128, 256, 512), 256, 768, seed=0)
     assert sum(w.size for w in weights.values()) == 7_395_808  # the published size
@@ -44,9 +45,10 @@ def test_full_width_checkpoint_agrees_with_the_oracle(tmp_path):
     points = rng.uniform(-0.5, 0.5, (1, 1024, 3)).astype(np.float32) * [[[0.6, 1, 0.9]]]
     points = (points - points.mean(axis=1, keepdims=True)).astype(np.float32)
     # F_s of such weights is large: queries spread accordingly, so that sdf varies over them.
-    scale = oracles.encode(weights, points[0])["F_s"]
-    queries = (scale * rng.uniform(-0.5, 0.5, (1, 32, 3))).astype(np.float32)
-    reference = {"points": points, "queries": queries} | oracles.outputs(weights, points, queries)
+    code = oracles.encode(weights, points[0])
+    queries = (code["F_s"] * rng.uniform(-0.5, 0.5, (1, 32, 3))).astype(np.float32)
+    outputs = code | {"sdf": oracles.decode(weights, code, queries[0].astype(np.float64))}
+    reference = {"points": points, "queries": queries} | {k: np.asarray(v)[None] for k, v in outputs.items()}
     assert np.ptp(reference["sdf"]) > 1e-3
     deviation = check_prior(read_checkpoint(path), reference)
     assert max(deviation.values()) <= 1e-5, deviation

@@ -1,6 +1,7 @@
 """Gradients through registration: finite differences confirm them, and both modes agree; masks may be closed over."""
 
 import dataclasses
+import itertools
 
 import jax
 import jax.numpy as jnp
@@ -16,8 +17,9 @@ from more2_jax.registration.pair_batch import batch_of, pair_up
 from more2_jax.registration.register import register
 from more2_jax.types import PointCloud
 
+pytestmark = pytest.mark.quickly
 COUNT = 64
-MASK = np.ones((1, COUNT), bool)  # closed over by what is compiled
+MASK = np.ones((2, COUNT), bool)  # closed over by what is compiled
 DESCENT = DescentRegistration(points=32, sdf_points=32, steps=5, icp_steps=2)
 SURFACE = SurfaceRegistration(
     search=SurfaceSearch(points=32, dense=64, cells=8, keep=2, steps=4),
@@ -39,8 +41,8 @@ def loss_with(method, candidates=None):
     """What registration ends with, as a function of both clouds (n, 3) and the prior; codes follow or are given."""
 
     def loss(source, target, prior, codes=None):
-        clouds = [PointCloud(points=x[None], mask=MASK) for x in (source, target)]
-        codes = codes or [encode(prior, c) for c in clouds]
+        clouds = [PointCloud(points=x[None], mask=MASK[:1]) for x in (source, target)]
+        codes = codes or codes_of(prior, source, target)
         pairs = pair_up(*map(batch_of, clouds, codes), candidates=candidates)
         return register(prior, pairs, method).loss[0]
 
@@ -48,7 +50,9 @@ def loss_with(method, candidates=None):
 
 
 def codes_of(prior, *clouds):
-    return [encode(prior, PointCloud(points=jnp.asarray(x)[None], mask=MASK)) for x in clouds]
+    """Of both clouds, encoded together."""
+    both = encode(prior, PointCloud(points=jnp.stack([jnp.asarray(x) for x in clouds]), mask=MASK))
+    return [jax.tree.map(lambda x, k=k: x[k : k + 1], both) for k in range(2)]
 
 
 @pytest.fixture(scope="module")
@@ -69,19 +73,19 @@ def test_gradient_through_encoder_kabsch_and_refinement_agrees_with_finite_diffe
         codes, loss = codes_of(prior, source, target), loss_with(DESCENT)
 
         def slopes(x, way, given):
-            """By reverse and by forward mode."""
-            gradient = jax.grad(lambda x: loss(x, target, prior, given))(x)
+            """The loss, and its slope by reverse and by forward mode."""
+            value, gradient = jax.value_and_grad(lambda x: loss(x, target, prior, given))(x)
             if given is None:
-                return gradient, jnp.vdot(gradient, way)
-            return gradient, jax.jvp(lambda x: loss(x, target, prior, given), (x,), (way,))[1]
+                return value, gradient, jnp.vdot(gradient, way)
+            return value, gradient, jax.jvp(lambda x: loss(x, target, prior, given), (x,), (way,))[1]
 
         for given in (None, codes):
-            at = quick_jit(lambda x, given=given: loss(x, target, prior, given))
             slopes_of = quick_jit(lambda x, way, given=given: slopes(x, way, given))
             for _ in range(4):
                 way, eps = jnp.asarray(rng.normal(size=source.shape)), 1e-6
-                slope = (at(source + eps * way) - at(source - eps * way)) / (2 * eps)
-                gradient, forward = slopes_of(source, way)
+                after, before = (slopes_of(source + s * way, way)[0] for s in (eps, -eps))
+                slope = (after - before) / (2 * eps)
+                _, gradient, forward = slopes_of(source, way)
                 assert gradient.dtype == jnp.float64 and bool(jnp.isfinite(gradient).all())
                 assert float(jnp.abs(gradient).max()) > 1e-4
                 along = float(jnp.vdot(gradient, way))
@@ -89,31 +93,51 @@ def test_gradient_through_encoder_kabsch_and_refinement_agrees_with_finite_diffe
                 assert float(forward) == pytest.approx(along, rel=1e-6)
 
 
-@pytest.mark.parametrize("moved", [0, 1], ids=["source", "target"])
-@pytest.mark.parametrize(
-    ("method", "candidates"),
-    [(DESCENT, start(10.0)), (SURFACE, start(10.0)), (SURFACE, None)],
-    ids=["descent", "surface", "surface without candidates"],
-)
-def test_both_modes_agree_whichever_cloud_is_traced(tiny_prior, clouds, method, candidates, moved):
-    """The other cloud and both codes are constants of the program."""
+METHODS = {
+    "descent": (DESCENT, start(10.0)),
+    "surface": (SURFACE, start(10.0)),
+    "surface without candidates": (SURFACE, None),
+}
+CASES = list(itertools.product(METHODS, ["source", "target"]))
+COMPILED = [CASES[k] for k in (0, 3, 4)]  # both clouds and every method; the others are traced, and slow
+
+
+def slopes_of_one(prior, clouds, method, moved):
+    """The loss by one cloud, that cloud, and the loss with its slopes in both modes; the rest are constants of it."""
     both = [jnp.asarray(x, jnp.float32) for x in clouds]
-    codes, loss = codes_of(tiny_prior, *both), loss_with(method, candidates)
-    way = jnp.asarray(np.random.default_rng(1).normal(size=both[0].shape), jnp.float32)
+    codes, loss = codes_of(prior, *both), loss_with(*METHODS[method])
 
     def of_one(x):
-        given = [x, both[1]] if moved == 0 else [both[0], x]
-        return loss(*given, tiny_prior, codes)
+        given = [x, both[1]] if moved == "source" else [both[0], x]
+        return loss(*given, prior, codes)
 
-    @quick_jit
     def slopes(x, way):
         value, forward = jax.jvp(of_one, (x,), (way,))
         return value, forward, jax.grad(of_one)(x)
 
-    value, forward, gradient = slopes(both[moved], way)
+    return of_one, both[moved == "target"], slopes
+
+
+@pytest.mark.parametrize(
+    ("method", "moved"),
+    [pytest.param(*c, marks=[pytest.mark.slow] * (c not in COMPILED)) for c in CASES],
+)
+def test_both_modes_agree_whichever_cloud_is_traced(tiny_prior, clouds, method, moved):
+    """The other cloud and both codes are constants of the program."""
+    of_one, cloud, slopes = slopes_of_one(tiny_prior, clouds, method, moved)
+    way = jnp.asarray(np.random.default_rng(1).normal(size=cloud.shape), jnp.float32)
+    value, forward, gradient = quick_jit(slopes)(cloud, way)
     assert bool(jnp.isfinite(gradient).all()) and float(jnp.abs(gradient).max()) > 1e-4
     assert float(forward) == pytest.approx(float(jnp.vdot(gradient, way)), rel=2e-3)
-    assert float(value) == pytest.approx(float(of_one(both[moved])), rel=1e-3)
+    assert float(value) == pytest.approx(float(of_one(cloud)), rel=1e-3)
+
+
+@pytest.mark.parametrize(("method", "moved"), [c for c in CASES if c not in COMPILED])
+def test_both_modes_take_either_cloud(tiny_prior, clouds, method, moved):
+    """Traced, not compiled: no constant and no rule of differentiation stands in the way."""
+    _, cloud, slopes = slopes_of_one(tiny_prior, clouds, method, moved)
+    value, forward, gradient = jax.eval_shape(slopes, cloud, cloud)
+    assert (value.shape, forward.shape, gradient.shape) == ((), (), cloud.shape)
 
 
 def test_gradients_through_the_encoder_reach_surface_registration(tiny_prior, clouds):
