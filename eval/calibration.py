@@ -21,17 +21,19 @@ from scipy.special import expit
 
 from eval.data.flyingshape import flyingshape
 from eval.data.truth import KnownScene
-from eval.harness.batched import embed_all
 from more2_jax.config import EvidenceMatcher, SceneConfig, preset
 from more2_jax.matching.assignment import NEVER, assign
 from more2_jax.matching.calibration import FREE, UNASKED, UNKNOWN, UPRIGHT, Calibration, features, weighed
-from more2_jax.matching.candidates import align_candidates, evidence_at
+from more2_jax.matching.candidates import compared_at, evidence_at
 from more2_jax.matching.pair_evidence import asks_prior
+from more2_jax.network.embedding_batch import embed
 from more2_jax.network.prior import Prior, load_prior
-from more2_jax.types import Instance, ObservedObject
+from more2_jax.scene import compared_objects, leveled_scan, rooms_of, start_scene, usable
+from more2_jax.tracking.scan_frame import common_frame
+from more2_jax.tracking.scan_height import Rooms
+from more2_jax.types import ObservedObject
 from train.run.program import run
 
-FEWEST = 64  # points of an instance that takes part
 RIDGE = 1e-6  # keeps weights finite where the rooms are told apart without a mistake
 SIGN = {"likeness": 1.0}  # the only evidence that speaks for a pair; all other speaks against it
 NEEDED = ("intercept", "nearer", "farther", "size", "likeness")  # what a `Calibration` must be told
@@ -46,13 +48,15 @@ class ScanPair:
     room: str
     among: Bool[np.ndarray, "n m"]
     known: dict[str, Float[np.ndarray, " p"]]
+    color: Float[np.ndarray, " p"]  # log likelihood ratios, which have weights of their own
     sure: Bool[np.ndarray, " p"]  # the prior knows something of both clouds
     one: Bool[np.ndarray, "n m"]  # one object, or copies of one
 
     def odds(self, c: Calibration) -> Float[np.ndarray, "n m"]:
         """Log odds of all pairs, as the package weighs them."""
         found = np.full(self.among.shape, NEVER)
-        found[self.among] = np.where(self.sure, weighed(self.known, c), weighed(self.known, UNASKED))
+        by_weights = np.where(self.sure, weighed(self.known, c), weighed(self.known, UNASKED))
+        found[self.among] = by_weights + self.color
         return found
 
 
@@ -92,15 +96,19 @@ def asked(config: SceneConfig) -> dict[str, Calibration]:
 
 
 def scan_pairs(room: str, scene: KnownScene, prior: Prior, config: SceneConfig) -> list[ScanPair]:
-    """The first scan's objects with those of every later one."""
-    scans = [[i for i in scan.instances if len(i.points) >= FEWEST] for scan in scene.scans]
-    codes = iter(embed_all(prior, [i.points for scan in scans for i in scan], 16))
-    known = [[ObservedObject(points=i.points, embedding=next(codes)) for i in scan] for scan in scans]
-    return [
-        scan_pair(room, prior, config, (known[0], known[b]), labels(scene, b, scans[0], scans[b]))
-        for b in range(1, len(scans))
-        if known[0] and known[b]
-    ]
+    """The first scan's objects with those of every later one, leveled and at the height that matching finds."""
+    first = start_scene(prior, scene.scans[0], config)
+    of_first = [o.observations[0].instance for o in first.objects]
+    found = []
+    for b, scan in enumerate(scene.scans[1:], start=1):
+        later, _ = leveled_scan(scan, config, first.scans[0])
+        instances, _ = usable(later, config)
+        codes = embed(prior, [i.points for i in instances])
+        old, new = compared_objects(first, instances, codes, later, config)
+        sides = [o for o, _ in old], new
+        one = labels(scene, b, of_first, [i.id for i in instances])
+        found.append(scan_pair(room, prior, config, sides, rooms_of(first, later), one))
+    return found
 
 
 def scan_pair(
@@ -108,13 +116,17 @@ def scan_pair(
     prior: Prior,
     config: SceneConfig,
     sides: tuple[Sequence[ObservedObject], Sequence[ObservedObject]],
+    rooms: Rooms,
     one: Bool[np.ndarray, "n m"],
 ) -> ScanPair:
     """Aligns the candidates of two scans."""
     matcher = evidence_matcher(config)
-    aligned = align_candidates(prior, *sides, matcher, config.motion)
-    known = features(evidence_at(aligned, matcher.search, config.motion), aligned.compared)
-    return ScanPair(room=room, among=aligned.among, known=known, sure=aligned.off_own <= UNKNOWN, one=one)
+    _, weighed_pairs = common_frame(prior, *sides, matcher, config.motion, rooms)
+    aligned, height_m = weighed_pairs.aligned, weighed_pairs.height_m
+    compared = compared_at(aligned, height_m)
+    known = features(evidence_at(aligned, matcher.search, config.motion, height_m), compared)
+    sure = aligned.off_own <= UNKNOWN
+    return ScanPair(room=room, among=aligned.among, known=known, color=compared.color, sure=sure, one=one)
 
 
 def evidence_matcher(config: SceneConfig) -> EvidenceMatcher:
@@ -124,24 +136,25 @@ def evidence_matcher(config: SceneConfig) -> EvidenceMatcher:
     return config.matching
 
 
-def labels(
-    scene: KnownScene, b: int, first: Sequence[Instance], later: Sequence[Instance]
-) -> Bool[np.ndarray, "n m"]:
-    """Which instances of the first scan and of scan `b` show one object, or copies of one."""
-    a = [scene.owner(0, i.id) for i in first]
-    c = [scene.owner(b, i.id) for i in later]
+def labels(scene: KnownScene, b: int, first: Sequence[int], later: Sequence[int]) -> Bool[np.ndarray, "n m"]:
+    """Which instances of the first scan and of scan `b`, by their ids, show one object, or copies of one."""
+    a = [scene.owner(0, i) for i in first]
+    c = [scene.owner(b, i) for i in later]
     return np.array([[x is not None and y is not None and x.copies == y.copies for y in c] for x in a])
 
 
 def fitted(pairs: Sequence[ScanPair], like: Calibration) -> Calibration:
     """Logistic regression on the evidence that `like` asks, each weight with the sign it must have."""
-    names = [k for k, v in asdict(like).items() if k != "intercept" and v != 0]
+    names = [k for k, v in asdict(like).items() if k not in ("intercept", "raised") and v != 0]
     known = np.concatenate([np.stack([p.known[k] for k in names], axis=1)[p.sure] for p in pairs])
-    one = np.concatenate([p.one[p.among][p.sure] for p in pairs])
+    one, color = (
+        np.concatenate([x[p.sure] for x, p in zip(part, pairs, strict=True)])
+        for part in ([p.one[p.among] for p in pairs], [p.color for p in pairs])
+    )
     x = np.concatenate([np.ones((len(known), 1)), known], axis=1)
 
     def loss(w: np.ndarray) -> tuple[float, np.ndarray]:
-        told = x @ w
+        told = x @ w + color
         slope = x.T @ (expit(told) - one) / len(x) + 2 * RIDGE * w
         return float(log_loss(told, one) + RIDGE * w @ w), slope
 
@@ -164,18 +177,34 @@ def log_loss(odds: Float[np.ndarray, " p"], one: Bool[np.ndarray, " p"]) -> floa
     return float(np.logaddexp(0.0, np.where(one, -odds, odds)).mean())
 
 
+def calibration_error(odds: Float[np.ndarray, " p"], one: Bool[np.ndarray, " p"], bins: int = 10) -> float:
+    """Expected calibration error: mean difference of what is said and what is true, over equal bins of probability."""
+    said = expit(odds)
+    in_bin = np.minimum((said * bins).astype(int), bins - 1)
+    off = [abs(said[in_bin == k].sum() - one[in_bin == k].sum()) for k in range(bins)]
+    return float(sum(off) / len(said))
+
+
 def report(pairs: Sequence[ScanPair], named: dict[str, Calibration], config: SceneConfig) -> None:
     """Prints the fitted weights and how well the shipped and the fitted ones tell who is who."""
     console = Console(width=120)
     table = Table(
-        "weights", "added", "log loss", "recall", "precision", "a quarter gone: recall", "precision", "F1"
+        "weights",
+        "added",
+        "log loss",
+        "off by",
+        "recall",
+        "precision",
+        "a quarter gone: recall",
+        "precision",
+        "F1",
     )
     several = len({p.room for p in pairs}) > 1
     for name, shipped in named.items():
         add_row(table, f"{name}, shipped", "", pairs, {p.room: shipped for p in pairs})
         by_room = left_out(pairs, shipped) if several else {}
         for added in (0.0, 1.0, 2.0, 3.0) if several else ():
-            raised = {k: replace(c, intercept=c.intercept + added) for k, c in by_room.items()}
+            raised = {k: replace(c, intercept=c.intercept + added, raised=added) for k, c in by_room.items()}
             add_row(table, f"{name}, fitted, rooms left out in turn", f"{added:g}", pairs, raised)
         weights = {k: round(v, 2) for k, v in asdict(fitted(pairs, shipped)).items() if v}
         console.print(f"{name}, fitted on all: {weights}")
@@ -189,12 +218,12 @@ def add_row(
 ) -> None:
     """One way to weigh."""
     odds = [p.odds(by_room[p.room]) for p in pairs]
-    told = np.concatenate([o[p.among] for o, p in zip(odds, pairs, strict=True)])
-    loss = log_loss(told, np.concatenate([p.one[p.among] for p in pairs]))
+    told = np.concatenate([o[p.among] - by_room[p.room].raised for o, p in zip(odds, pairs, strict=True)])
+    one = np.concatenate([p.one[p.among] for p in pairs])
     whole = counts([(o, p.one) for o, p in zip(odds, pairs, strict=True)])
     fewer = counts(thinned(odds, pairs))
     shares = [f"{100 * x:.1f} %" for x in (*whole[:2], *fewer)]
-    table.add_row(name, added, f"{loss:.3f}", *shares)
+    table.add_row(name, added, f"{log_loss(told, one):.3f}", f"{calibration_error(told, one):.3f}", *shares)
 
 
 def thinned(

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float, Int
 from scipy.optimize import linear_sum_assignment
-from scipy.special import expit
 
 LogOdds = Float[np.ndarray, "n m"]
 FARTHEST_M = 10.0  # what moved farther is no less likely for it
@@ -45,11 +44,16 @@ def interchangeable(odds: LogOdds, pairs: Int[np.ndarray, "p 2"]) -> list[bool]:
     return [exchanged(int(k), int(i)) for k, i in pairs]
 
 
-def unmatched(odds: LogOdds, pairs: Int[np.ndarray, "p 2"]) -> tuple[dict[int, float], dict[int, float]]:
-    """Objects and instances left over, each with the probability that none of the others left over is it."""
-    n, m = odds.shape
+def unmatched(
+    chance: Float[np.ndarray, "n m"], pairs: Int[np.ndarray, "p 2"]
+) -> tuple[dict[int, float], dict[int, float]]:
+    """Objects and instances left over, each with the probability that none of the others left over is it.
+
+    `chance`: of every pair, to be one object.
+    """
+    n, m = chance.shape
     objects = sorted(set(range(n)) - set(pairs[:, 0].tolist()))
     instances = sorted(set(range(m)) - set(pairs[:, 1].tolist()))
-    alone = 1 - expit(odds[np.ix_(objects, instances)])
+    alone = 1 - chance[np.ix_(objects, instances)]
     gone = {k: float(p) for k, p in zip(objects, alone.prod(axis=1), strict=True)}
     return gone, {i: float(p) for i, p in zip(instances, alone.prod(axis=0), strict=True)}

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
+from scipy.special import expit
 
 from more2_jax.config import MotionModel, SurfaceSearch
 from more2_jax.matching.pair_evidence import PairEvidence, asks_prior
@@ -28,7 +29,10 @@ class Compared:
 
 @dataclass(frozen=True, kw_only=True)
 class Calibration:
-    """Log odds that two clouds show one object, linear in what is known of the pair (docs/relocalization.md)."""
+    """Log odds that two clouds show one object, linear in what is known of the pair (docs/relocalization.md).
+
+    Every piece of evidence is bounded, so that none outvotes all others where a mask is cut or dirty.
+    """
 
     intercept: float
     nearer: float  # of the smaller mean truncated distance of the two ways,
@@ -39,21 +43,33 @@ class Calibration:
     top: float = 0.0  # of `top_m`, in shares of the radius, at most `HIGHEST`
     off_less: float = 0.0  # of the smaller distance off the other's completed surface,
     off_more: float = 0.0  # and of the larger
+    # Of the intercept, by how much it lowers the threshold of an assignment: pairs that win one are likelier right than
+    # others, and a pair missed is two false changes. No part of a probability.
+    raised: float = 0.0
 
 
-HIGHEST = 0.2
+HIGHEST = 0.1
 UNKNOWN = 0.5  # of `off_own`: a prior that lays a cloud so far off its own surface has no say
 
 
 # Logistic regression on pairs of validation rooms; how, and how well it holds, is in docs/relocalization.md.
-UPRIGHT = Calibration(intercept=3.7, nearer=-6.9, farther=-1.0, size=-2.7, likeness=2.6, lift=-2.5, top=-21.0)
+UPRIGHT = Calibration(
+    intercept=5.6, nearer=-9.5, farther=-2.1, size=0.0, likeness=1.0, lift=-2.5, top=-20.4, raised=2.0
+)
 FREE = Calibration(
-    intercept=2.6, nearer=-6.9, farther=0.0, size=-4.0, likeness=7.25, off_less=-11.1, off_more=-6.5
+    intercept=7.5,
+    nearer=-17.1,
+    farther=0.0,
+    size=0.0,
+    likeness=4.7,
+    off_less=-10.7,
+    off_more=-12.6,
+    raised=3.0,
 )
 
 
 # Without the prior's say.
-UNASKED = Calibration(intercept=1.2, nearer=-9.9, farther=-3.3, size=-4.2, likeness=5.7)
+UNASKED = Calibration(intercept=3.4, nearer=-22.9, farther=-4.3, size=-0.1, likeness=7.5, raised=3.0)
 
 
 def calibrated(
@@ -69,6 +85,15 @@ def calibrated(
     if not asks_prior(search, motion):
         return unasked
     return np.where(evidence.off_own <= UNKNOWN, log_odds(evidence, compared, FREE), unasked)
+
+
+def probability(
+    odds: Float[np.ndarray, "*pairs"], search: SurfaceSearch, motion: MotionModel
+) -> Float[np.ndarray, "*pairs"]:
+    """Of pairs to be one object, by their log odds as `calibrated` has them."""
+    if motion == "upright":
+        return expit(odds - UPRIGHT.raised)
+    return expit(odds - (FREE if asks_prior(search, motion) else UNASKED).raised)
 
 
 def log_odds(evidence: PairEvidence, compared: Compared, c: Calibration) -> Float[np.ndarray, "*pairs"]:

@@ -118,11 +118,14 @@ def odds_of(
     `NEVER` for pairs that were not aligned.
     """
     evidence = evidence_at(aligned, search, motion, height_m)
-    top = np.abs(aligned.top_gap_m - height_m)
-    known = dataclasses.replace(aligned.compared, top_m=top)
     odds = np.full(aligned.among.shape, NEVER)
-    odds[aligned.among] = calibrated(evidence, known, search, motion)
+    odds[aligned.among] = calibrated(evidence, compared_at(aligned, height_m), search, motion)
     return odds
+
+
+def compared_at(aligned: AlignedPairs, height_m: float) -> Compared:
+    """What is known of the pairs without aligning them, at a common height."""
+    return dataclasses.replace(aligned.compared, top_m=np.abs(aligned.top_gap_m - height_m))
 
 
 def evidence_at(

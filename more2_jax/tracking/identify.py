@@ -7,11 +7,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Float
-from scipy.special import expit
 
 from more2_jax.config import CodeMatcher, EvidenceMatcher, SceneConfig
 from more2_jax.geometry.poses import apply_pose
 from more2_jax.matching.assignment import assign, interchangeable, unmatched
+from more2_jax.matching.calibration import probability
 from more2_jax.matching.candidates import AlignedPairs
 from more2_jax.matching.code_assignment import match_instances
 from more2_jax.network.embedding_batch import stack
@@ -86,9 +86,10 @@ def by_evidence(
     moved_m = np.linalg.norm(centers(old)[:, None] - there[None], axis=-1)
     pairs = assign(odds, moved_m, matcher.motion_weight)
     copies = interchangeable(odds, pairs)
-    gone, fresh = unmatched(odds, pairs)
+    chance = probability(odds, matcher.search, config.motion)
+    gone, fresh = unmatched(chance, pairs)
     found = tuple(
-        Found(object=int(k), instance=int(i), score=float(expit(odds[k, i])), interchangeable=c)
+        Found(object=int(k), instance=int(i), score=float(chance[k, i]), interchangeable=c)
         for (k, i), c in zip(pairs, copies, strict=True)
     )
     return Identified(found=found, gone=gone, new=fresh, frame=frame, aligned=weighed.aligned)

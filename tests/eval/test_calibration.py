@@ -11,6 +11,7 @@ from scipy.special import expit
 
 from eval.calibration import (
     ScanPair,
+    calibration_error,
     counts,
     fitted,
     labels,
@@ -38,7 +39,8 @@ def drawn(room: str, count: int, seed: int, c: Calibration = PLANTED) -> ScanPai
     told = c.intercept + sum(getattr(c, k) * v for k, v in known.items())
     one = rng.random(count) < expit(told)
     among = np.ones((1, count), bool)
-    return ScanPair(room=room, among=among, known=known, sure=np.ones(count, bool), one=one[None])
+    sure, color = np.ones(count, bool), np.zeros(count)
+    return ScanPair(room=room, among=among, known=known, color=color, sure=sure, one=one[None])
 
 
 def test_weights_that_drew_the_truth_are_found_and_evidence_never_speaks_the_wrong_way():
@@ -68,6 +70,26 @@ def test_a_rooms_weights_are_fitted_without_it():
     assert by_room == {"a": fitted(pairs[2:], PLANTED), "b": fitted(pairs[:2], PLANTED)}
 
 
+def test_colors_are_evidence_with_a_weight_of_their_own():
+    """Colors that decided with odds of 3 either way: the other weights are found beside them."""
+    rng = np.random.default_rng(0)
+    pair = drawn("a", 40_000, 0)
+    color = rng.choice([-3.0, 3.0], 40_000)
+    one = rng.random(40_000) < expit(pair.odds(PLANTED)[0] + color)
+    found = fitted([dataclasses.replace(pair, color=color, one=one[None])], PLANTED)
+    assert found.nearer == pytest.approx(PLANTED.nearer, abs=0.35)
+    assert found.intercept == pytest.approx(PLANTED.intercept, abs=0.35)
+
+
+def test_calibration_error_by_hand():
+    odds = np.log(np.array([0.9, 0.9, 0.9, 0.9, 0.25, 0.25]) / np.array([0.1, 0.1, 0.1, 0.1, 0.75, 0.75]))
+    one = np.array([True, True, True, False, False, True])
+    assert calibration_error(odds, one) == pytest.approx((4 * 0.15 + 2 * 0.25) / 6)
+    rng = np.random.default_rng(0)
+    many = rng.normal(scale=3, size=50_000)
+    assert calibration_error(many, rng.random(50_000) < expit(many)) < 0.01
+
+
 def test_log_loss_by_definition_and_where_odds_are_large():
     odds, one = np.array([0.3, -2.0, 800.0]), np.array([True, False, False])
     assert log_loss(odds[:2], one[:2]) == pytest.approx(-np.log(expit(0.3) * (1 - expit(-2.0))) / 2)
@@ -76,7 +98,7 @@ def test_log_loss_by_definition_and_where_odds_are_large():
 
 def test_copies_are_one_object_and_what_a_scan_lacks_is_nothing():
     scene = known_scene(copies=("a", "b", "b"), scans=2)
-    first, later = (s.instances for s in scene.scans)
+    first, later = ([i.id for i in s.instances] for s in scene.scans)
     found = labels(scene, 1, first, later)
     assert found.tolist() == [[True, False, False], [False, True, True], [False, True, True]]
     gone = dataclasses.replace(scene, objects=scene.objects[1:])

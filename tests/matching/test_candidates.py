@@ -145,7 +145,7 @@ def test_in_any_orientation_the_evidence_is_that_of_the_best_pose(tiny_prior):
 
 def test_what_is_left_over_is_gone_unless_another_left_over_may_be_it():
     odds = np.array([[2.0, -1.0, -2.0], [-3.0, -1.0, NEVER]])
-    gone, new = unmatched(odds, np.array([[0, 0]]))
+    gone, new = unmatched(expit(odds), np.array([[0, 0]]))
     assert gone == {1: pytest.approx(1 - expit(-1.0))}
     assert new == {1: pytest.approx(1 - expit(-1.0)), 2: pytest.approx(1.0)}
 
