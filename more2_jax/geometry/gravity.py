@@ -22,7 +22,9 @@ SCALE_M = 0.015  # of the Geman-McClure weights: a point that far off its level 
 LEAST_ON_LEVELS = 0.05  # share of the points that levels must hold together, walls through them left out,
 LEAST_ON_LEVEL = 0.02  # and each of them
 LEAST_POINTS = 200
-LEAST_WIDTH_M = 0.15  # standard deviation of the levels' points, the narrower way: of a strip half a meter wide
+LEAST_WIDTH_M = (
+    0.15  # standard deviation of the levels' points, the narrower way: of a strip half a meter wide
+)
 REACH_M = 50.0  # along an axis: a stray point a kilometer off must not make a million layers
 TRIED_POINTS = 5000  # at even steps, along the directions tried
 MOST_POINTS = 20_000  # at even steps, for the rest

@@ -201,12 +201,7 @@ def scene_to_json(scene: LivingScene) -> dict[str, Any]:
                 "instances": [int(i) for i in s.instances],
                 "skipped": [{"what": k.what, "reason": k.reason} for k in s.skipped],
                 "sensors": np.asarray(s.sensors, np.float64).tolist(),
-                "frame": {
-                    "T_scene_scan": np.asarray(s.frame.T_scene_scan, np.float64).tolist(),
-                    "sigma_m": float(s.frame.sigma_m),
-                    "sigma_deg": float(s.frame.sigma_deg),
-                    "tilt_deg": s.frame.tilt_deg,
-                },
+                "frame": _frame_to_json(s.frame, scene.upright),
             }
             for s in scene.scans
         ],
@@ -225,6 +220,16 @@ def scene_to_json(scene: LivingScene) -> dict[str, Any]:
         ],
         "timing_s": {k: float(scene.timing_s.get(k, 0.0)) for k in (*STAGES, *scene.timing_s)},
     }
+
+
+def _frame_to_json(frame: Frame, upright: bool) -> dict[str, Any]:
+    """A scan's frame; by how much the scan was leveled, where it was, is for people: `T_scene_scan` holds it."""
+    content = {
+        "T_scene_scan": np.asarray(frame.T_scene_scan, np.float64).tolist(),
+        "sigma_m": float(frame.sigma_m),
+        "sigma_deg": float(frame.sigma_deg),
+    }
+    return content | ({"tilt_deg": frame.tilt_deg} if upright and frame.tilt_deg > 0 else {})
 
 
 def _object_to_json(o: SceneObject) -> dict[str, Any]:
