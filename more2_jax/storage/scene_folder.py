@@ -204,12 +204,7 @@ def scene_to_json(scene: LivingScene) -> dict[str, Any]:
                 "not_seen": list(s.not_seen),
                 "repairs": [_repair_to_json(r) for r in s.repairs],
                 "sensors": np.asarray(s.sensors, np.float64).tolist(),
-                "frame": {
-                    "T_scene_scan": np.asarray(s.frame.T_scene_scan, np.float64).tolist(),
-                    "sigma_m": float(s.frame.sigma_m),
-                    "sigma_deg": float(s.frame.sigma_deg),
-                    "tilt_deg": s.frame.tilt_deg,
-                },
+                "frame": _frame_to_json(s.frame, scene.upright),
             }
             for s in scene.scans
         ],
@@ -234,6 +229,16 @@ def scene_to_json(scene: LivingScene) -> dict[str, Any]:
 def _repair_to_json(r: Repair) -> dict[str, Any]:
     lists = {"instances": [int(i) for i in r.instances], "absorbed": list(r.absorbed)}
     return {"object": r.object, **lists, "share": float(r.share)}
+
+
+def _frame_to_json(frame: Frame, upright: bool) -> dict[str, Any]:
+    """A scan's frame; by how much the scan was leveled, where it was, is for people: `T_scene_scan` holds it."""
+    content = {
+        "T_scene_scan": np.asarray(frame.T_scene_scan, np.float64).tolist(),
+        "sigma_m": float(frame.sigma_m),
+        "sigma_deg": float(frame.sigma_deg),
+    }
+    return content | ({"tilt_deg": frame.tilt_deg} if upright and frame.tilt_deg > 0 else {})
 
 
 def _object_to_json(o: SceneObject) -> dict[str, Any]:

@@ -68,7 +68,7 @@ def test_the_frame_of_a_scan_is_that_of_its_observations(tmp_path):
     again, _ = load_scene(tmp_path / "scene")
     assert_same(scene, again)
     content = json.loads((tmp_path / "scene/scene.json").read_text())
-    tilts = [s["frame"].pop("tilt_deg") for s in content["scans"]]
+    tilts = [s["frame"].pop("tilt_deg", 0.0) for s in content["scans"]]
     assert tilts == [s.frame.tilt_deg for s in again.scans]
     (tmp_path / "scene/scene.json").write_text(json.dumps(content))  # as written before tilts were
     assert_same(scene, load_scene(tmp_path / "scene")[0])
