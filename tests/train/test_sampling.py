@@ -56,7 +56,8 @@ def shapes(count: int = 4) -> Shapes:
     sdf = np.linalg.norm(query, axis=-1, keepdims=True) - radius[:, None, None]
     uniform, near = (jnp.asarray(a, jnp.float16) for a in np.concatenate([query, sdf], axis=-1))
     views = direction * radius[:, None, None, None]
-    return Shapes(views=jnp.asarray(views, jnp.float16), sdf_uniform=uniform, sdf_near=near)
+    outward = jnp.asarray(np.rint(127 * direction), jnp.int8)
+    return Shapes(views=jnp.asarray(views, jnp.float16), normals=outward, sdf_uniform=uniform, sdf_near=near)
 
 
 def test_clean_samples_are_points_of_the_chosen_shape():
@@ -287,6 +288,7 @@ def test_samples_follow_the_shapes_when_these_are_permuted():
 def test_a_shape_that_is_one_point_gives_one_kept_point():
     one = Shapes(
         views=jnp.zeros((1, 24, 8, 3), jnp.float16),
+        normals=jnp.zeros((1, 24, 8, 3), jnp.int8),
         sdf_uniform=jnp.ones((1, 9, 4), jnp.float16),
         sdf_near=jnp.ones((1, 9, 4), jnp.float16),
     )
