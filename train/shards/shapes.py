@@ -25,7 +25,9 @@ class Shape:
     vertices: Float[np.ndarray, "v 3"]
     faces: Int[np.ndarray, "f 3"]
     views: Float[np.ndarray, "views n 3"]  # float16, back-projected depth
-    normals: Int[np.ndarray, "views n 3"]  # int8: outward unit normals there times `NORMAL_STEPS`; 0: not known
+    normals: Int[
+        np.ndarray, "views n 3"
+    ]  # int8: outward unit normals there times `NORMAL_STEPS`; 0: not known
     sdf_uniform: Float[np.ndarray, "q 4"]  # float16: x y z and signed distance, negative inside
     sdf_near: Float[np.ndarray, "q 4"]
     fingerprint: Float[np.ndarray, "8 8 8"]  # float16 signed distances on a grid
