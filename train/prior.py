@@ -80,7 +80,7 @@ def main(
         name: of the weights; by default the configuration file's.
         warm_start: weights to begin with in a fresh `--out`: name of shipped ones, or a file; the optimizer starts
             anew. The configuration's `model` has to be theirs.
-        val_shards: where validation shapes are taken from, so that they stay the same while `shards` grow; by default `shards`.
+        val_shards: folders of the validation shapes, which then stay the same while `shards` grow; by default `shards`.
         resident_share: of the memory (the device's, on accelerators) that shapes may take; larger collections are read
             from disk a batch at a time. The numbers are the same.
         coordinator: host:port of process 0, on a run of several processes.
