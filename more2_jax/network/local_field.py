@@ -33,7 +33,7 @@ MIN_VARIANCE = (
 
 
 NEAR_PLANE = (
-    0.03  # at the start of training, canonical units: planes so near to a query count in the second blend
+    0.015  # at the start of training, canonical units: heights up to about this count in the second blend
 )
 LEAST_SHARE = 0.02  # of the weight: anchors of known normals that have less of it say little
 
