@@ -186,6 +186,9 @@ def test_gradients_are_finite_with_few_real_points(prior, cloud):
 # --- normals ------------------------------------------------------------------------------------------------
 
 
+placed, field = quick_jit(encode_one), quick_jit(sdf_one)
+
+
 def weights_of(q, position, bandwidth=0.1):
     """The blend's weights, every row summing to 1."""
     squared = jnp.sum((q[:, None] - position) ** 2, axis=-1)
@@ -273,10 +276,18 @@ def test_heights_of_a_thin_board_have_the_sign_of_the_nearer_side():
 
 
 @pytest.fixture(scope="module")
-def seeing(prior):
-    """A random decoder that looks normals up."""
-    decoder = dataclasses.replace(prior.config.decoder, normals=True)
-    return init_prior(dataclasses.replace(prior.config, decoder=decoder), jax.random.key(3))
+def seeing():
+    """A small random prior whose decoder looks normals up."""
+    model = load_config(ROOT / "configs" / "tiny.yaml", TrainingRun).model
+    decoder = dataclasses.replace(
+        model.decoder,
+        narrow_skip=False,
+        local_blocks=(1, 3),
+        local_channels=4,
+        bandwidths=(0.1,),
+        normals=True,
+    )
+    return init_prior(dataclasses.replace(model, decoder=decoder), jax.random.key(3))
 
 
 def test_a_field_with_normals_moves_with_the_object_and_depends_on_them(seeing, cloud):
@@ -285,17 +296,17 @@ def test_a_field_with_normals_moves_with_the_object_and_depends_on_them(seeing, 
         jaxlie.SO3.sample_uniform(jax.random.key(0)), jnp.array([3.0, -2.0, 1.0])
     )
     mask, queries = jnp.ones(len(cloud), bool), 1.2 * cloud[:40]
-    embedding = encoded(seeing, cloud, mask, normals)
-    expected = distance(seeing, embedding, queries)
+    embedding = placed(seeing, cloud, mask, normals)
+    expected = field(seeing, embedding, queries)
     turned = jax.vmap(lambda n: T.rotation() @ n)(normals)
     moved = jax.vmap(lambda p: T @ (2.5 * p))
-    again = encoded(seeing, moved(cloud), mask, turned)
-    np.testing.assert_allclose(distance(seeing, again, moved(queries)), expected, atol=5e-4)
+    again = placed(seeing, moved(cloud), mask, turned)
+    np.testing.assert_allclose(field(seeing, again, moved(queries)), expected, atol=5e-4)
     carried = transform(rescale(embedding, 2.5), T)
-    np.testing.assert_allclose(distance(seeing, carried, moved(queries)), expected, atol=5e-4)
+    np.testing.assert_allclose(field(seeing, carried, moved(queries)), expected, atol=5e-4)
     for other in (-normals, jnp.zeros_like(normals)):
-        blind = encoded(seeing, cloud, mask, other)
-        assert np.abs(distance(seeing, blind, queries) - expected).max() > 1e-3
+        blind = placed(seeing, cloud, mask, other)
+        assert np.abs(field(seeing, blind, queries) - expected).max() > 1e-3
         for name in ("inv", "eqv", "scale", "center"):  # codes are of positions alone
             np.testing.assert_array_equal(getattr(blind, name), getattr(embedding, name))
 

@@ -42,6 +42,11 @@ def prior():
 
 
 @pytest.fixture(scope="module")
+def seeing(prior):
+    return seeing_normals(prior)
+
+
+@pytest.fixture(scope="module")
 def sample(tmp_path_factory, training):
     shapes = load_mix([sphere_shards(tmp_path_factory.mktemp("shards"))], "train")[0]
     draw = quick_jit(sample_batch, static_argnames=("config", "points"))
@@ -49,13 +54,12 @@ def sample(tmp_path_factory, training):
     return shapes, draw(jax.random.key(0), shapes, jnp.arange(2), known, points=64)
 
 
-def test_a_decoder_that_begins_to_see_normals_says_what_it_said(prior, sample):
-    seeing = seeing_normals(prior)
+def test_a_decoder_that_begins_to_see_normals_says_what_it_said(prior, seeing, sample):
     check_shapes(seeing, "widened")
     one = jax.tree.map(lambda x: x[0, 0], sample[1])
     normals = jnp.where(one.mask[:, None], one.points, 0.0) / 0.45
-    embedding = encode_ordered(prior, one.points, one.mask, normals)
-    before, after = (sdf_one(p, embedding, one.queries) for p in (prior, seeing))
+    embedding = quick_jit(encode_ordered)(prior, one.points, one.mask, normals)
+    before, after = (quick_jit(sdf_one)(p, embedding, one.queries) for p in (prior, seeing))
     assert np.ptp(before) > 1e-3
     np.testing.assert_allclose(after, before, atol=1e-6)
 
@@ -72,13 +76,12 @@ def test_warm_start_takes_weights_of_a_decoder_without_normals(prior, tmp_path):
         started_warm(prior.config, str(tmp_path / "seeing.npz"), "mine")
 
 
-def test_a_step_of_the_decoder_leaves_the_encoder_to_the_bit(prior, sample, training):
-    mesh = device_mesh(1)
-    state = initial_state(seeing_normals(prior), training)
+def test_a_step_of_the_decoder_leaves_the_encoder_to_the_bit(seeing, sample, training):
+    mesh, state = device_mesh(1), initial_state(seeing, training)
     before = jax.device_get(state.params)
-    model = seeing_normals(prior).config
+    step = quick_jit(training_step.__wrapped__, static_argnames=("model", "config", "mesh"))
     for _ in range(2):
-        state, terms = training_step(state, sample[0], jnp.arange(2), model=model, config=training, mesh=mesh)
+        state, terms = step(state, sample[0], jnp.arange(2), model=seeing.config, config=training, mesh=mesh)
     assert set(terms) == {"sdf", "sign", "gradient"}
     for weights in (state.params, state.average):
         jax.tree.map(np.testing.assert_array_equal, before["encoder"], jax.device_get(weights["encoder"]))
