@@ -19,7 +19,6 @@ from train.run.settings import TrainingRun
 from train.run.shape_mix import load_mix
 from train.run.start import seeing_normals, started_warm
 from train.run.state import initial_state, training_step
-from train.shards.losses import total_loss
 from train.shards.sampling import sample_batch
 
 
@@ -91,16 +90,3 @@ def test_a_step_of_the_decoder_leaves_the_encoder_to_the_bit(seeing, sample, tra
         - before["decoder"]["layer_0"]["direction"]
     )
     assert (changed.max(axis=1) > 0)[rows:].mean() > 0.5  # rows of zeros learn
-
-
-def test_the_decoders_gradient_is_that_of_the_whole(prior, sample, training):
-    """What is left out of the loss does not reach the decoder: the terms of the codes, and the encoder's weights."""
-
-    def loss(params, config):
-        return total_loss(dataclasses.replace(prior, params=params), sample[1], config, jax.random.key(0))[0]
-
-    of = quick_jit(jax.grad(loss), static_argnames="config")
-    whole, alone = (
-        of(prior.params, dataclasses.replace(training, train=t))["decoder"] for t in ("all", "decoder")
-    )
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-5, rtol=1e-4), whole, alone)
