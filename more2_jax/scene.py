@@ -43,7 +43,7 @@ def start_scene(
     instances, skipped = usable(scan, config)
     timing: dict[str, float] = {}
     with staged(timing, progress, "encode", len(instances), scan=scan.name):
-        embeddings = embed(prior, [i.points for i in instances])
+        embeddings = embed(prior, [i.points for i in instances], [i.normals for i in instances])
     objects = [new_object(k, 0, i, e) for k, (i, e) in enumerate(zip(instances, embeddings, strict=True))]
     return LivingScene(
         preset=config.preset,
@@ -68,7 +68,7 @@ def add_scan(
     index, timing, objects = len(scene.scans), dict(scene.timing_s), list(scene.objects)
     stage = partial(staged, timing, progress, scan=scan.name)
     with stage("encode", len(instances)):
-        embeddings = embed(prior, [i.points for i in instances])
+        embeddings = embed(prior, [i.points for i in instances], [i.normals for i in instances])
     with stage("match", len(instances)):
         old, new = compared_objects(scene, instances, embeddings, scan, config)
         known = [o for o, _ in old]

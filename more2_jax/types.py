@@ -226,6 +226,9 @@ class Instance:
     points: Float[np.ndarray, "n 3"]
     label: str | None = None
     colors: Integer[np.ndarray, "n 3"] | None = None  # uint8
+    normals: Float[np.ndarray, "n 3"] | None = (
+        None  # of the surface, outward; zeros where not known. None: nowhere
+    )
 
 
 @dataclass(frozen=True, kw_only=True)

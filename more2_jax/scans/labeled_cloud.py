@@ -42,6 +42,7 @@ class LabeledCloud:
     points: Float[np.ndarray, "n 3"]  # float64, in the file's unit
     instance: Integer[np.ndarray, "n"] | None  # 0 and negative: background; None: the file has no masks
     colors: Integer[np.ndarray, "n 3"] | None = None  # uint8
+    normals: Float[np.ndarray, "n 3"] | None = None  # outward, of any length; zeros where not known
     point_labels: np.ndarray | None = None  # (n,) str or integer
     labels: dict[int, str] = field(default_factory=dict)  # instance → label, where the format says it once
     skipped: tuple[Skipped, ...] = ()

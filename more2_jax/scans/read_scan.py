@@ -186,8 +186,9 @@ def _instances(
             reason = f"{len(rows)} points; needed {min_points}"
             skipped.append(Skipped(what=f"instance {index}", reason=reason))
             continue
-        colors = None if cloud.colors is None else cloud.colors[rows]
-        kept.append(Instance(id=index, points=points[rows], label=_label(cloud, index, rows), colors=colors))
+        colors, normals = (None if x is None else x[rows] for x in (cloud.colors, cloud.normals))
+        label = _label(cloud, index, rows)
+        kept.append(Instance(id=index, points=points[rows], label=label, colors=colors, normals=normals))
     return tuple(kept), tuple(skipped)
 
 

@@ -14,6 +14,7 @@ from more2_jax.scans.labeled_cloud import one_line
 
 INSTANCE_PROPERTIES = ("instance", "instance_id", "objectId", "object_id", "label")
 COLOR_PROPERTIES = ("red", "green", "blue")
+NORMAL_PROPERTIES = ("nx", "ny", "nz")
 CORNERS = ("vertex_indices", "vertex_index")
 
 
@@ -36,6 +37,14 @@ class PlyCloud:
             return None
         rgb = np.stack([self.properties[c] for c in COLOR_PROPERTIES], axis=-1)
         return np.clip(rgb * 255.0 if rgb.dtype.kind == "f" else rgb, 0, 255).astype(np.uint8)
+
+    @property
+    def normals(self) -> Float[np.ndarray, "n 3"] | None:
+        """nx, ny, nz as float64; None where the file has none. Rows that are not finite are zeros: not known."""
+        if not all(c in self.properties for c in NORMAL_PROPERTIES):
+            return None
+        normals = np.stack([self.properties[c].astype(np.float64) for c in NORMAL_PROPERTIES], axis=-1)
+        return np.where(np.isfinite(normals).all(axis=1, keepdims=True), normals, 0.0)
 
 
 def read_ply(path: Path) -> PlyCloud:

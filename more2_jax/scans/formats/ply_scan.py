@@ -23,6 +23,7 @@ def read(path: Path, options: ReadOptions) -> LabeledCloud:
         points=cloud.points,
         instance=None if name is None else cloud.properties[name].astype(np.int64),
         colors=cloud.colors,
+        normals=cloud.normals,
         point_labels=labels if labels is not None and labels.dtype.kind in "iu" else None,
     )
 
