@@ -23,8 +23,8 @@ from train.shards.augmentation import (
     merge_views,
     start_far_out,
 )
-from train.shards.settings import SampleConfig
-from train.shards.shards import NORMAL_STEPS, Shapes
+from train.shards.settings import NORMAL_STEPS, SampleConfig
+from train.shards.shards import Shapes
 
 Views = tuple[
     Float[Array, "v n 3"], Int8[Array, "v n 3"]

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+NORMAL_STEPS = 127  # of a normal's coordinate in shards, one byte; a normal of zeros is not known
+
 
 @dataclass(frozen=True)
 class SampleConfig:

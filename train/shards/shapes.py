@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 from train.furniture.closed_solids import canonical, solidify
 from train.furniture.source_mesh import SourceMesh, check_mesh
 from train.shards.depth_views import coverage, depth_views
-from train.shards.shards import NORMAL_STEPS
+from train.shards.settings import NORMAL_STEPS
 from train.shards.signed_distance import BOX, QUERIES, is_inside, signed_distances
 
 FINGERPRINT_SIDE = 8  # of the grid of distances by which near-duplicates are found

@@ -27,7 +27,6 @@ if TYPE_CHECKING:  # making shapes needs the extra `data`, training on them does
 MAPPED = ("views", "normals", "sdf_uniform", "sdf_near")  # what samples are drawn from
 ARRAYS = (*MAPPED, "fingerprint")
 EXCLUDED = "excluded.json"
-NORMAL_STEPS = 127  # of a normal's coordinate, in one byte; a normal of zeros is not known
 
 
 @pytree
