@@ -27,10 +27,10 @@ from scipy.spatial.transform import Rotation
 
 from eval.scores.figures import mean_ci95
 from more2_jax.config import CodeMatcher
-from more2_jax.geometry.points import farthest_points, kabsch_rotation
+from more2_jax.geometry.points import kabsch_rotation
 from more2_jax.matching.code_assignment import hungarian, score_matrix
 from more2_jax.metrics import symmetry_aware_rotation_error_deg
-from more2_jax.network.prior import Prior, encode_ordered, field_sdf, load_prior, object_field
+from more2_jax.network.prior import Prior, encode_one, field_sdf, load_prior, object_field
 from more2_jax.types import Embedding
 from train.furniture.symmetry import yaw_symmetry
 from train.run.program import run
@@ -39,6 +39,7 @@ from train.shards.shards import ShardView, open_shards, read_solids, shard_folde
 BATCH = 8
 RIGHT_DEG = 10.0
 NEAR = 4096  # queries near the surface, for the sign
+TILT_DEG, INWARD = 10.0, 0.05  # of normals: as training has them
 VERTICAL = np.array([0.0, 0.0, 1.0])
 
 
@@ -50,6 +51,7 @@ class Row:
     near_sign: float
     iou: float
     rotation_deg: float
+    near_error: float  # mean error of the distance near the surface, canonical units
 
 
 def main(
@@ -60,6 +62,7 @@ def main(
     views: tuple[int, ...] = (3, 2, 1),
     points: int = 50_000,
     noise: float = 0.005,
+    normals: bool = True,
     scenes: int = 400,
     most: int | None = None,
     seed: int = 0,
@@ -74,6 +77,7 @@ def main(
         views: numbers of depth images that a cloud is merged from.
         points: uniform in the unit cube, for the intersection over union.
         noise: standard deviation of every coordinate, canonical units.
+        normals: given where the prior looks them up, tilted and some of them inward; otherwise none are known.
         scenes: of 4 to 8 shapes, for matching.
         most: score no more shapes than this.
         seed: of viewpoints, noise, orientations and scenes.
@@ -85,7 +89,7 @@ def main(
     orders = [symmetry[name] for name in names]
     results: dict[str, Any] = {"prior": weights.name, "split": split, "shapes": count}
     for number in views:
-        rows, codes = score_shapes(weights, shapes, orders, count, number, points, noise, seed)
+        rows, codes = score_shapes(weights, shapes, orders, count, number, points, noise, normals, seed)
         results[f"{number} views"] = summary(rows) | {"instance recall": matching(codes, scenes, seed)}
     out.mkdir(parents=True, exist_ok=True)
     (out / "results.json").write_text(json.dumps(results, indent=1))
@@ -107,6 +111,7 @@ def score_shapes(
     views: int,
     points: int,
     noise: float,
+    normals: bool,
     seed: int,
 ) -> tuple[list[Row], Embedding]:
     """A row a shape, and the codes of both clouds (shapes, 2, …)."""
@@ -116,13 +121,15 @@ def score_shapes(
         seen = [
             see_twice(shapes[k], views, points, noise, np.random.default_rng((seed, views, k))) for k in index
         ]
-        embedding, sign, iou, turn = jax.device_get(
-            score_batch(prior, *(np.stack([s[name] for s in seen]) for name in SEEN))
+        clouds, near, uniform, known = (np.stack([s[name] for s in seen]) for name in (*SEEN, "normals"))
+        embedding, sign, error, iou, turn = jax.device_get(
+            score_batch(prior, clouds, normals * known, near, uniform)
         )
         codes.append(embedding)
         for k, n in enumerate(index[: count - start]):
-            error = rotation_error(turn[k], seen[k]["rotation"], orders[n])
-            rows.append(Row(shapes.meta[n]["category"], float(sign[k]), float(iou[k]), error))
+            turned = rotation_error(turn[k], seen[k]["rotation"], orders[n])
+            category = shapes.meta[n]["category"]
+            rows.append(Row(category, float(sign[k]), float(iou[k]), turned, float(error[k])))
     return rows, jax.tree.map(lambda *x: np.concatenate(x)[:count], *codes)
 
 
@@ -133,44 +140,59 @@ def see_twice(
     shape: Mapping[str, np.ndarray], views: int, points: int, noise: float, rng: np.random.Generator
 ) -> dict[str, np.ndarray]:
     """Two clouds in random orientations; queries and true distances in the first one's frame."""
+    (of_normals,) = rng.spawn(1)  # clouds are the same with normals and without
     rotation = Rotation.from_quat(rng.normal(size=(2, 4))).as_matrix()
-    clouds = []
+    clouds, normals = [], []
     for R in rotation:
         chosen = rng.choice(len(shape["views"]), views, replace=False)
         merged = np.asarray(shape["views"][chosen], np.float64).reshape(-1, 3)
-        clouds.append((rng.permutation(merged) + noise * rng.normal(size=merged.shape)) @ R.T)
+        order = rng.permutation(len(merged))
+        clouds.append((merged[order] + noise * rng.normal(size=merged.shape)) @ R.T)
+        outward = np.asarray(shape["normals"][chosen], np.float64).reshape(-1, 3)[order]
+        normals.append(flawed(outward, of_normals) @ R.T)
     known = {"near": shape["sdf_near"][:NEAR], "uniform": shape["sdf_uniform"][:points]}
     turned = {
         k: np.concatenate([v[:, :3].astype(np.float64) @ rotation[0].T, v[:, 3:]], axis=1)
         for k, v in known.items()
     }
-    return {"clouds": np.stack(clouds), "rotation": rotation} | turned
+    return {"clouds": np.stack(clouds), "normals": np.stack(normals), "rotation": rotation} | turned
+
+
+def flawed(normals: Float[np.ndarray, "n 3"], rng: np.random.Generator) -> Float[np.ndarray, "n 3"]:
+    """Unit normals, tilted by `TILT_DEG` each of two ways, `INWARD` of them pointing inward; zeros stay."""
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    tilted = normals / np.maximum(length, 1e-9) + np.deg2rad(TILT_DEG) * rng.normal(size=normals.shape)
+    sign = np.where(rng.random((len(normals), 1)) < INWARD, -1.0, 1.0)
+    return np.where(length > 0, sign * tilted / np.linalg.norm(tilted, axis=1, keepdims=True), 0.0)
 
 
 @jax.jit
 def score_batch(
     prior: Prior,
     clouds: Float[Array, "b 2 n 3"],
+    normals: Float[Array, "b 2 n 3"],
     near: Float[Array, "b q 4"],
     uniform: Float[Array, "b u 4"],
-) -> tuple[Embedding, Float[Array, " b"], Float[Array, " b"], Float[Array, "b 3 3"]]:
-    """Codes, share of right signs, intersection over union, and the rotation between the clouds (Kabsch)."""
+) -> tuple[Embedding, Float[Array, " b"], Float[Array, " b"], Float[Array, " b"], Float[Array, "b 3 3"]]:
+    """Codes, share of right signs and error near the surface, overlap, and the rotation between the clouds (Kabsch)."""
 
-    def encode(points: Float[Array, "n 3"]) -> Embedding:
-        real = jnp.ones(len(points), bool)
-        return encode_ordered(prior, *farthest_points(points, real, prior.config.encoder.points))
+    def encode(points: Float[Array, "n 3"], normals: Float[Array, "n 3"]) -> Embedding:
+        return encode_one(prior, points, jnp.ones(len(points), bool), normals)
 
-    def one(pair: Array, near: Array, uniform: Array) -> tuple[Embedding, Array, Array, Array]:
-        codes = jax.vmap(encode)(pair)
+    def one(
+        pair: Array, normals: Array, near: Array, uniform: Array
+    ) -> tuple[Embedding, Array, Array, Array, Array]:
+        codes = jax.vmap(encode)(pair, normals)
         field = object_field(prior, jax.tree.map(lambda x: x[0], codes))
-        right = (field_sdf(prior, field, near[:, :3]) < 0) == (near[:, 3] < 0)
+        distance = field_sdf(prior, field, near[:, :3])
+        right, error = (distance < 0) == (near[:, 3] < 0), jnp.abs(distance - near[:, 3])
         inside, truth = field_sdf(prior, field, uniform[:, :3]) < 0, uniform[:, 3] < 0
         union = jnp.maximum((inside | truth).sum(), 1)
         turn = kabsch_rotation(codes.eqv[0].T, codes.eqv[1].T).as_matrix()
-        return codes, right.mean(), (inside & truth).sum() / union, turn
+        return codes, right.mean(), error.mean(), (inside & truth).sum() / union, turn
 
     # One after the other: fifty thousand queries of one shape fill the processor.
-    return jax.lax.map(lambda x: one(*x), (clouds, near, uniform))
+    return jax.lax.map(lambda x: one(*x), (clouds, normals, near, uniform))
 
 
 def rotation_error(R: np.ndarray, true: Float[np.ndarray, "2 3 3"], order: int) -> float:
@@ -203,6 +225,7 @@ def summary(rows: Sequence[Row]) -> dict[str, Any]:
     """Means with their intervals, and the same by category."""
     values = {
         "near-surface sign": np.array([r.near_sign for r in rows]),
+        "near-surface error": np.array([r.near_error for r in rows]),
         "IoU": np.array([r.iou for r in rows]),
         "Kabsch, RE < 10°": np.array([r.rotation_deg < RIGHT_DEG for r in rows], float),
     }

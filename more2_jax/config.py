@@ -44,6 +44,7 @@ class DecoderConfig:
     ] = ()  # 0-based encoder blocks whose points and features the decoder looks up
     local_channels: int = 16  # of every level and bandwidth
     bandwidths: tuple[float, ...] = (0.05, 0.15)  # at the start of training, canonical units
+    normals: bool = False  # the anchors' normals, where they are known, are looked up too
 
 
 @dataclass(frozen=True)

@@ -60,7 +60,7 @@ def start_scene(
     instances, skipped = usable(level, config)
     timing: dict[str, float] = {}
     with staged(timing, progress, "encode", len(instances), scan=scan.name):
-        embeddings = embed(prior, [i.points for i in instances])
+        embeddings = embed(prior, [i.points for i in instances], [i.normals for i in instances])
     objects = [new_object(k, 0, i, e) for k, (i, e) in enumerate(zip(instances, embeddings, strict=True))]
     objects, frame = as_given(objects, 0, SCENE_FRAME, T_level_scan)
     return LivingScene(
@@ -87,7 +87,7 @@ def add_scan(
     index, timing, objects = len(scene.scans), dict(scene.timing_s), list(scene.objects)
     stage = partial(staged, timing, progress, scan=scan.name)
     with stage("encode", len(instances)):
-        embeddings = embed(prior, [i.points for i in instances])
+        embeddings = embed(prior, [i.points for i in instances], [i.normals for i in instances])
     with stage("match", len(instances)):
         old, new = compared_objects(scene, instances, embeddings, level, config)
         known = [o for o, _ in old]

@@ -75,6 +75,8 @@ class PointCloud:
     origin: Float[Array | np.ndarray, "*batch 3"] | None = quantity(
         "origin", default=None
     )  # in the scan's frame
+    # Unit normals of the surface, outward; zeros where not known. None: nowhere.
+    normals: Float[Array, "*batch n 3"] | None = quantity("direction", default=None)
 
 
 @pytree
@@ -95,6 +97,8 @@ class Anchors:
     offset: Float[Array, "*batch a 3"] = quantity("offset")  # meters, relative to the embedding's `center`
     features: Float[Array, "*batch a 3 f"] = quantity("columns")  # unit norm over (3, f)
     mask: Bool[Array, "*batch a"] = quantity("invariant")  # True where the anchor is real
+    # Unit normals of the surface, outward; zeros where not known. None: nowhere.
+    normal: Float[Array, "*batch a 3"] | None = quantity("direction", default=None)
 
 
 @pytree

@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import time
+from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
@@ -62,6 +63,7 @@ def main(
     minutes: float = math.inf,
     name: str = "",
     warm_start: str = "",
+    val_shards: tuple[Path, ...] = (),
     resident_share: float = 0.4,
     coordinator: str = "",
     processes: int = 1,
@@ -78,6 +80,7 @@ def main(
         name: of the weights; by default the configuration file's.
         warm_start: weights to begin with in a fresh `--out`: name of shipped ones, or a file; the optimizer starts
             anew. The configuration's `model` has to be theirs.
+        val_shards: folders of the validation shapes, which then stay the same while `shards` grow; by default `shards`.
         resident_share: of the memory (the device's, on accelerators) that shapes may take; larger collections are read
             from disk a batch at a time. The numbers are the same.
         coordinator: host:port of process 0, on a run of several processes.
@@ -90,7 +93,8 @@ def main(
     device_a_core(settings.training.batch, coordinator)
     connect(coordinator, processes, process)
     first = started_warm(settings.model, warm_start, name) if warm_start else None
-    setting = prepared(settings, shards, out, deadline, name, first, resident_share * memory_bytes())
+    sources = shards, val_shards or shards
+    setting = prepared(settings, sources, out, deadline, name, first, resident_share * memory_bytes())
     train_and_save(setting)
 
 
@@ -108,17 +112,20 @@ def train_and_save(setting: Setting) -> None:
 
 def prepared(
     settings: TrainingRun,
-    shards: tuple[Path, ...],
+    sources: tuple[Sequence[Path], Sequence[Path]],
     out: Path,
     deadline: float,
     name: str,
     warm: Prior | None,
     most_bytes: float,
 ) -> Setting:
-    """Opens the shapes, of which `most_bytes` may be in memory, and initializes the weights if none are given."""
+    """Opens the shapes, of which `most_bytes` may be in memory, and initializes the weights if none are given.
+
+    `sources`: of training shapes, and of validation shapes.
+    """
     training = settings.training
     mesh = device_mesh(training.batch)
-    train, val = open_mix(shards, "train"), open_mix(shards, "val")
+    train, val = open_mix(sources[0], "train"), open_mix(sources[1], "val")
     return Setting(
         training=training,
         prior=warm or started_cold(settings, train, name),

@@ -11,6 +11,7 @@ from jaxtyping import Float
 from more2_jax.types import PointCloud
 
 MIN_POINTS = 256  # the smallest bucket of points
+LEAST_LENGTH = 1e-6  # of a normal that is one
 MAX_POINTS = 2048  # what a stage looks at of one object; more is kept by the scene, and thinned evenly here
 
 
@@ -19,20 +20,53 @@ def bucket(count: int, smallest: int = 1) -> int:
     return max(smallest, 1 << max(count - 1, 0).bit_length())
 
 
-def pad_clouds(clouds: Sequence[Float[np.ndarray, "_ 3"]], size: int | None = None) -> PointCloud:
+Rows = Float[np.ndarray, "_ 3"]
+
+
+def pad_clouds(
+    clouds: Sequence[Rows], size: int | None = None, normals: Sequence[Rows | None] | None = None
+) -> PointCloud:
     """Batches ragged clouds: (objects, bucket, 3), centered on each cloud's own `origin` (float64).
 
     The point farthest from the mean comes first: farthest-point sampling starts there, so that the order of
     a cloud's points does not matter. Clouds beyond `MAX_POINTS` are thinned evenly by index. `size` sets the
-    bucket. Raises ValueError on an empty list, a shape that is not (n, 3), no points, or points that are not finite.
+    bucket. `normals`: the points' unit normals, outward; None for a cloud, or zeros for a point, where not known.
+    Raises ValueError on an empty list, a shape that is not (n, 3), no points, points that are not finite, and normals
+    that are not as many as the points.
     """
     if not len(clouds):
         raise ValueError("pad_clouds got no clouds; needed at least one")
-    checked = [_check(np.asarray(cloud, np.float64), i) for i, cloud in enumerate(clouds)]
+    whole = [_check(np.asarray(cloud, np.float64), i) for i, cloud in enumerate(clouds)]
+    checked = [cloud[_kept(len(cloud))] for cloud in whole]
     size = size or bucket(max(map(len, checked)), MIN_POINTS)
-    rows = [_pad(cloud, size) for cloud in checked]
-    points, masks, origins = (np.stack(part) for part in zip(*rows, strict=True))
-    return PointCloud(points=jnp.asarray(points), mask=jnp.asarray(masks), origin=origins)
+    orders = [_order(cloud, size) for cloud in checked]
+    origins = np.stack([cloud.mean(axis=0) for cloud in checked])
+    rows = [(cloud - o)[order] for cloud, o, order in zip(checked, origins, orders, strict=True)]
+    masks = np.stack([np.arange(size) < len(cloud) for cloud in checked])
+    turned = None
+    if normals is not None:
+        known = [_directions(n, len(c), i) for i, (n, c) in enumerate(zip(normals, whole, strict=True))]
+        turned = jnp.asarray(np.stack([n[_kept(len(n))][o] for n, o in zip(known, orders, strict=True)]))
+    points = jnp.asarray(np.stack(rows).astype(np.float32))
+    return PointCloud(points=points, mask=jnp.asarray(masks), origin=origins, normals=turned)
+
+
+def _kept(count: int) -> np.ndarray:
+    """Rows of a cloud that stay: all, or `MAX_POINTS` of them, evenly."""
+    return np.linspace(0, count - 1, min(count, MAX_POINTS)).astype(int)
+
+
+def _directions(normals: np.ndarray | None, count: int, index: int) -> np.ndarray:
+    """Rows of unit length or zero, float32."""
+    if normals is None:
+        return np.zeros((count, 3), np.float32)
+    if normals.shape != (count, 3):
+        raise ValueError(
+            f"cloud {index} has normals of shape {normals.shape}; needed ({count}, 3), as its points"
+        )
+    given = np.nan_to_num(np.asarray(normals, np.float64), nan=0.0, posinf=0.0, neginf=0.0)
+    length = np.linalg.norm(given, axis=1, keepdims=True)
+    return np.where(length > LEAST_LENGTH, given / np.maximum(length, LEAST_LENGTH), 0.0).astype(np.float32)
 
 
 def _check(cloud: np.ndarray, index: int) -> np.ndarray:
@@ -40,19 +74,15 @@ def _check(cloud: np.ndarray, index: int) -> np.ndarray:
         raise ValueError(f"cloud {index} has shape {cloud.shape}; needed (n, 3) with n ≥ 1")
     if bad := int((~np.isfinite(cloud).all(axis=1)).sum()):
         raise ValueError(f"cloud {index} has {bad} points that are not finite; needed finite coordinates")
-    if len(cloud) > MAX_POINTS:
-        cloud = cloud[np.linspace(0, len(cloud) - 1, MAX_POINTS).astype(int)]
     return cloud
 
 
-def _pad(cloud: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _order(cloud: np.ndarray, size: int) -> np.ndarray:
+    """Rows in a bucket's order: the farthest from the mean first, which the filler repeats."""
     if len(cloud) > size:
         raise ValueError(f"a cloud has {len(cloud)} points; needed at most the bucket's {size}")
-    origin = cloud.mean(axis=0)
-    centered = cloud - origin
-    first = int(np.argmax((centered**2).sum(axis=1)))
-    order = np.r_[first, np.delete(np.arange(len(cloud)), first), np.full(size - len(cloud), first)]
-    return centered[order].astype(np.float32), np.arange(size) < len(cloud), origin
+    first = int(np.argmax(((cloud - cloud.mean(axis=0)) ** 2).sum(axis=1)))
+    return np.r_[first, np.delete(np.arange(len(cloud)), first), np.full(size - len(cloud), first)]
 
 
 def pad_batch(cloud: PointCloud, count: int) -> PointCloud:
@@ -68,4 +98,5 @@ def take(cloud: PointCloud, index: np.ndarray | Sequence[int]) -> PointCloud:
         points=cloud.points[jnp.asarray(chosen)],
         mask=cloud.mask[jnp.asarray(chosen)],
         origin=np.asarray(cloud.origin)[chosen],
+        normals=None if cloud.normals is None else cloud.normals[jnp.asarray(chosen)],
     )

@@ -22,9 +22,20 @@ def farthest_points(
 
     Exact duplicates are taken once: rows beyond the distinct points repeat one and are masked out.
     """
-    points = jnp.where(
-        mask[:, None], points, 0.0
-    )  # whatever stands in masked rows, even NaN, goes no further
+    points = cleared(points, mask)
+    index, real = farthest_rows(points, mask, count)
+    return points[index], real
+
+
+def cleared(rows: Float[Array, "n 3"], mask: Bool[Array, " n"]) -> Float[Array, "n 3"]:
+    """Zeros in masked rows: whatever stands there, even NaN, goes no further."""
+    return jnp.where(mask[:, None], rows, 0.0)
+
+
+def farthest_rows(
+    points: Float[Array, "n 3"], mask: Bool[Array, " n"], count: int
+) -> tuple[Int[Array, " count"], Bool[Array, " count"]]:
+    """Which rows `farthest_points` takes, for what else stands in them; masked points must be finite."""
     x, y, z = fixed = jax.lax.stop_gradient(points).T
     row = jnp.arange(len(points), dtype=jnp.int32)
 
@@ -40,7 +51,7 @@ def farthest_points(
     start = (jnp.where(mask, jnp.inf, -1.0).astype(points.dtype), jnp.argmax(mask).astype(jnp.int32))
     _, (index, more) = jax.lax.scan(body, start, length=count)
     real = jnp.concatenate([jnp.any(mask)[None], more[:-1]])
-    return points[index], real
+    return index, real
 
 
 def sample(points: Float[Array, "n 3"], mask: Bool[Array, " n"], count: int) -> Sampled:

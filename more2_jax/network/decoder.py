@@ -68,10 +68,10 @@ class Decoder(nn.Module):
     def setup(self) -> None:
         d, e = self.config.decoder, self.config.encoder
         self.lookups = [
-            LocalLookup(d.local_channels, d.bandwidths, e.widths[i], name=f"local_{i}")
+            LocalLookup(d.local_channels, d.bandwidths, e.widths[i], d.normals, name=f"local_{i}")
             for i in d.local_blocks
         ]
-        self.local_width = len(d.local_blocks) * local_width(d.local_channels, len(d.bandwidths))
+        self.local_width = len(d.local_blocks) * local_width(d.local_channels, len(d.bandwidths), d.normals)
         self.code_width = 2 * e.code + 1
         self.input_width = self.code_width + self.local_width
         widths = [d.hidden] * d.layers
@@ -121,7 +121,10 @@ class Decoder(nn.Module):
         length = jnp.sqrt(jnp.maximum(jnp.sum(q * q, axis=-1, keepdims=True), 1e-30))
         looked_up = [lookup.query(f, q) for lookup, f in zip(self.lookups, field.local, strict=True)]
         q = jnp.concatenate([q, length], axis=-1)
-        local_features = jnp.concatenate([q[:, :0], *looked_up], axis=-1)
+        # What normals say comes last: rows that a decoder without them does not have.
+        local_features = jnp.concatenate(
+            [q[:, :0], *(f for f, _ in looked_up), *(h for _, h in looked_up)], axis=-1
+        )
         first, skip = (k[len(k) - self.local_width :] for k in (kernels[0][0], kernels[d.skip_layer][0]))
         h = self._activate(q @ field.first[0] + field.first[1] + local_features @ first, train)
         for i in range(1, d.layers):

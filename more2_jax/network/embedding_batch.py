@@ -6,23 +6,27 @@ from collections.abc import Sequence
 
 import jax
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 
-from more2_jax.geometry.padding import MAX_POINTS, bucket, pad_batch, pad_clouds
+from more2_jax.geometry.padding import MAX_POINTS, Rows, bucket, pad_batch, pad_clouds
 from more2_jax.network.prior import Prior, encode
 from more2_jax.types import Embedding, PointCloud
 
 SMALLEST_BATCH = 8  # scenes of up to so many objects share their compiled programs
 
 
-def padded(clouds: Sequence[Float[np.ndarray, "_ 3"]], smallest: int = SMALLEST_BATCH) -> PointCloud:
+def padded(
+    clouds: Sequence[Rows], smallest: int = SMALLEST_BATCH, normals: Sequence[Rows | None] | None = None
+) -> PointCloud:
     """Ragged clouds as one batch of one shape for all scenes: (bucket, `MAX_POINTS`, 3). Fillers repeat the first."""
-    return pad_batch(pad_clouds(clouds, MAX_POINTS), bucket(len(clouds), smallest))
+    return pad_batch(pad_clouds(clouds, MAX_POINTS, normals), bucket(len(clouds), smallest))
 
 
-def embed(prior: Prior, clouds: Sequence[Float[np.ndarray, "_ 3"]]) -> list[Embedding]:
-    """One embedding per cloud, in one call."""
-    return unstack(encode(prior, padded(clouds)), len(clouds))
+def embed(
+    prior: Prior, clouds: Sequence[Rows], normals: Sequence[Rows | None] | None = None
+) -> list[Embedding]:
+    """One embedding per cloud, in one call; `normals` as `pad_clouds` takes them."""
+    return unstack(encode(prior, padded(clouds, normals=normals)), len(clouds))
 
 
 def unstack(batch: Embedding, count: int) -> list[Embedding]:

@@ -166,8 +166,12 @@ class Encoder(nn.Module):
     keep: tuple[int, ...] = ()  # blocks whose points and features the embedding takes along
 
     @nn.compact
-    def __call__(self, points: Float[Array, "n 3"], mask: Bool[Array, "n"]) -> Embedding:
+    def __call__(
+        self, points: Float[Array, "n 3"], mask: Bool[Array, "n"], normals: Float[Array, "n 3"] | None = None
+    ) -> Embedding:
+        """The codes are of the positions alone; `normals` (zeros: not known) stand by the anchors."""
         c = self.config
+        normals = jnp.zeros_like(points) if normals is None else normals
         mean = masked_mean(points, mask)
         centered = jnp.where(mask[:, None], points - mean, 0.0)
         radius = power_of_two(jnp.sqrt(masked_mean(jnp.sum(centered**2, axis=-1), mask)))
@@ -183,7 +187,7 @@ class Encoder(nn.Module):
             eqv=eqv,
             scale=norm(x).mean() * c.output_scale * radius,
             center=mean + offset,
-            anchors=tuple(anchors(centered - offset, *levels[i]) for i in self.keep),
+            anchors=tuple(anchors(centered - offset, normals, *levels[i]) for i in self.keep),
         )
 
     def blocks(
@@ -206,9 +210,20 @@ class Encoder(nn.Module):
         return levels
 
 
-def anchors(offset: Float[Array, "n 3"], features: Float[Array, "a 3 f"], mask: Bool[Array, " a"]) -> Anchors:
+def anchors(
+    offset: Float[Array, "n 3"],
+    normals: Float[Array, "n 3"],
+    features: Float[Array, "a 3 f"],
+    mask: Bool[Array, " a"],
+) -> Anchors:
     """The first rows of the cloud, as many as there are features, each feature brought to unit norm."""
-    return Anchors(offset=offset[: len(features)], features=channel_normalize(features), mask=mask)
+    count = len(features)
+    return Anchors(
+        offset=offset[:count],
+        features=channel_normalize(features),
+        mask=mask,
+        normal=jnp.where(mask[:, None], normals[:count], 0.0),
+    )
 
 
 def neighbor_counts(config: EncoderConfig, points: int) -> list[int]:

@@ -19,7 +19,7 @@ from jax.core import Tracer
 from jaxtyping import Bool, Float
 
 from more2_jax.config import PriorConfig, from_dict
-from more2_jax.geometry.points import farthest_points
+from more2_jax.geometry.points import cleared, farthest_rows
 from more2_jax.network.decoder import Decoder, ObjectField
 from more2_jax.network.encoder import Encoder, neighbor_counts
 from more2_jax.types import Embedding, PointCloud, pytree
@@ -66,28 +66,43 @@ def _shapes(config: PriorConfig) -> tuple[dict[str, Any], Embedding]:
     return {"encoder": of_encoder["params"], "decoder": of_decoder["params"]}, embedding
 
 
-def encode_ordered(prior: Prior, points: Float[Array, "n 3"], mask: Bool[Array, " n"]) -> Embedding:
-    """Φ of one cloud already in farthest-point order; differentiable."""
+def encode_ordered(
+    prior: Prior,
+    points: Float[Array, "n 3"],
+    mask: Bool[Array, " n"],
+    normals: Float[Array, "n 3"] | None = None,
+) -> Embedding:
+    """Φ of one cloud already in farthest-point order, unit normals where known; differentiable."""
     encoder = Encoder(prior.config.encoder, keep=prior.config.decoder.local_blocks)
-    return encoder.apply({"params": prior.params["encoder"]}, points, mask)  # type: ignore[return-value]
+    return encoder.apply({"params": prior.params["encoder"]}, points, mask, normals)  # type: ignore[return-value]
 
 
-def encode_one(prior: Prior, points: Float[Array, "n 3"], mask: Bool[Array, " n"]) -> Embedding:
+def encode_one(
+    prior: Prior,
+    points: Float[Array, "n 3"],
+    mask: Bool[Array, " n"],
+    normals: Float[Array, "n 3"] | None = None,
+) -> Embedding:
     """Φ of one cloud: farthest-point sampling to the encoder's input size, then the network; differentiable."""
-    return encode_ordered(prior, *farthest_points(points, mask, prior.config.encoder.points))
+    points = cleared(points, mask)
+    index, real = farthest_rows(points, mask, prior.config.encoder.points)
+    return encode_ordered(prior, points[index], real, None if normals is None else normals[index])
 
 
 @jax.jit
-def _encode_many(prior: Prior, points: Float[Array, "b n 3"], mask: Bool[Array, "b n"]) -> Embedding:
-    return jax.vmap(partial(encode_one, prior))(points, mask)
+def _encode_many(
+    prior: Prior, points: Float[Array, "b n 3"], mask: Bool[Array, "b n"], normals: Float[Array, "b n 3"]
+) -> Embedding:
+    return jax.vmap(partial(encode_one, prior))(points, mask, normals)
 
 
 def encode(prior: Prior, cloud: PointCloud) -> Embedding:
     """Encodes a batch of clouds (from `pad_clouds`): Φ(sRX + t) = (F_inv, R·F_eqv, s·F_s, sR·F_c + t), paper §3.1.
 
     Returns a batch of embeddings whose `center` is in meters relative to `origin`, which is the cloud's. Points, mask
-    and weights may be traced: a mask is then taken as it is. Raises ValueError for points that are no batch of clouds,
-    a mask of another shape, and a cloud that is known to have no real point.
+    and weights may be traced: a mask is then taken as it is. The cloud's normals go along with the anchors; the four
+    codes are of the positions alone. Raises ValueError for points that are no batch of clouds, a mask or normals of
+    another shape, and a cloud that is known to have no real point.
     """
     points, mask = cloud.points, cloud.mask
     if points.ndim != 3 or points.shape[-1] != 3:
@@ -96,7 +111,11 @@ def encode(prior: Prior, cloud: PointCloud) -> Embedding:
         raise ValueError(f"encode got a mask of shape {mask.shape}; needed {points.shape[:2]}, as the points")
     if not isinstance(mask, Tracer) and (empty := np.flatnonzero(~np.asarray(mask).any(-1))).size:
         raise ValueError(f"clouds {empty.tolist()} have no points; encode needs at least one each")
-    return dataclasses.replace(_encode_many(prior, points, mask), origin=cloud.origin)
+    # Zeros, not None: clouds with and without normals share a compiled program.
+    normals = jnp.zeros_like(points) if cloud.normals is None else cloud.normals
+    if normals.shape != points.shape:
+        raise ValueError(f"encode got normals of shape {normals.shape}; needed {points.shape}, as the points")
+    return dataclasses.replace(_encode_many(prior, points, mask, normals), origin=cloud.origin)
 
 
 def check_embedding(prior: Prior, embedding: Embedding, who: str) -> None:

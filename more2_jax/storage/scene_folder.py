@@ -341,7 +341,16 @@ def _stacked(embeddings: list[Embedding]) -> dict[str, np.ndarray]:
     for level, name in itertools.product(range(len(embeddings[0].anchors)), ANCHORS):
         rows = [np.asarray(getattr(e.anchors[level], name)) for e in embeddings]
         stacked[f"anchors_{level}_{name}"] = np.stack(rows)
+    for level in range(len(embeddings[0].anchors)):
+        normal = np.stack([_normals(e.anchors[level]) for e in embeddings])
+        if normal.any():  # folders of scenes without normals have no such arrays
+            stacked[f"anchors_{level}_normal"] = normal
     return stacked
+
+
+def _normals(anchors: Anchors) -> np.ndarray:
+    """Zeros where none is known."""
+    return np.zeros_like(anchors.offset) if anchors.normal is None else np.asarray(anchors.normal)
 
 
 def _embeddings(path: Path) -> dict[str, Embedding]:
@@ -351,8 +360,12 @@ def _embeddings(path: Path) -> dict[str, Embedding]:
 
     def one(n: int) -> Embedding:
         parts = [{k: stacked[f"anchors_{level}_{k}"][n] for k in ANCHORS} for level in range(levels)]
-        anchors = tuple(Anchors(**part) for part in parts)
-        return Embedding(**{k: stacked[k][n] for k in EMBEDDING}, anchors=anchors)
+        known = [stacked.get(f"anchors_{level}_normal") for level in range(levels)]
+        anchors = [
+            Anchors(**part, normal=np.zeros_like(part["offset"]) if normal is None else normal[n])
+            for part, normal in zip(parts, known, strict=True)
+        ]
+        return Embedding(**{k: stacked[k][n] for k in EMBEDDING}, anchors=tuple(anchors))
 
     return {str(i): one(n) for n, i in enumerate(stacked["id"])}
 

@@ -52,7 +52,8 @@ def leveled(scan: Scan, T_level_scan: Pose) -> Scan:
 
 def leveled_instance(i: Instance, T_level_scan: Pose) -> Instance:
     """One instance of a leveled scan."""
-    return dataclasses.replace(i, points=apply_pose(T_level_scan, i.points))
+    normals = None if i.normals is None else i.normals @ T_level_scan[:3, :3].T
+    return dataclasses.replace(i, points=apply_pose(T_level_scan, i.points), normals=normals)
 
 
 def as_given(

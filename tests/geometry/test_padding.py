@@ -110,3 +110,38 @@ def test_fillers_repeat_the_first_and_take_undoes_them():
     again = take(filled, [2, 1])
     np.testing.assert_array_equal(again.points, batch.points[np.array([2, 1])])
     np.testing.assert_array_equal(again.origin, batch.origin[[2, 1]])
+
+
+# --- normals ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("count", [1, 40, 3 * MAX_POINTS])
+def test_normals_stay_with_their_points(count):
+    """Of points on a sphere the normal is the direction, whatever order and thinning did."""
+    points = RNG.normal(size=(count, 3))
+    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    batch = pad_clouds([points + 7.0], normals=[3.0 * points])  # any length, unit in the end
+    kept = np.asarray(batch.points[0], np.float64) + batch.origin[0] - 7.0
+    np.testing.assert_allclose(batch.normals[0], kept, atol=1e-5)
+
+
+def test_normals_that_are_not_known_are_zeros():
+    normals = np.ones((10, 3))
+    normals[4], normals[5] = np.nan, 0.0
+    batch = pad_clouds([np.arange(30.0).reshape(10, 3), cloud(20)], normals=[normals, None])
+    known = np.linalg.norm(batch.normals, axis=-1)
+    assert np.isclose(known[0, :10], 1).sum() == 8 and (known[0] == 0).sum() == 2
+    assert not known[1].any()
+    assert pad_clouds([cloud(10)]).normals is None
+
+
+def test_fillers_and_choices_carry_normals():
+    clouds = [cloud(10), cloud(20)]
+    batch = pad_clouds(clouds, normals=clouds)
+    np.testing.assert_array_equal(pad_batch(batch, 4).normals[3], batch.normals[0])
+    np.testing.assert_array_equal(take(batch, [1]).normals[0], batch.normals[1])
+
+
+def test_normals_of_another_number_are_refused():
+    with pytest.raises(ValueError, match=r"cloud 1 has normals of shape \(9, 3\); needed \(10, 3\)"):
+        pad_clouds([cloud(10)] * 2, normals=[None, cloud(9)])

@@ -85,7 +85,12 @@ def records():
     """One of each kind that has a place, float64 on the host; with and without an origin of its own."""
     rng = np.random.default_rng(0)
     cloud = PointCloud(points=numbers(rng, 5, 3), mask=np.ones(5, bool))
-    anchors = Anchors(offset=numbers(rng, 4, 3), features=numbers(rng, 4, 3, 2), mask=np.ones(4, bool))
+    anchors = Anchors(
+        offset=numbers(rng, 4, 3),
+        features=numbers(rng, 4, 3, 2),
+        mask=np.ones(4, bool),
+        normal=Rotation.random(4, random_state=3).as_matrix()[:, 0],
+    )
     code = Embedding(
         inv=numbers(rng, 6),
         eqv=numbers(rng, 3, 6),

@@ -1,5 +1,7 @@
 """Laws of Φ for random weights: it turns, scales and shifts with the object, and sees nothing else."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -204,6 +206,12 @@ def test_encode_refuses_clouds_without_points(tiny_prior):
     empty = PointCloud(points=cloud.points, mask=cloud.mask.at[1].set(False), origin=cloud.origin)
     with pytest.raises(ValueError, match=r"clouds \[1\] have no points"):
         encode(tiny_prior, empty)
+
+
+def test_encode_refuses_normals_of_another_shape(tiny_prior):
+    cloud = pad_clouds([furniture(0)] * 2)
+    with pytest.raises(ValueError, match=r"normals of shape \(2, 3\)"):
+        encode(tiny_prior, dataclasses.replace(cloud, normals=jnp.ones((2, 3))))
 
 
 def test_init_refuses_an_input_too_small_for_its_neighbors():

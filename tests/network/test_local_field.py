@@ -14,7 +14,17 @@ from places import ROOT
 
 from more2_jax.config import load_config
 from more2_jax.geometry.transform import rescale, transform
-from more2_jax.network.local_field import MIN_VARIANCE, LocalLookup, local_width, plane_offsets
+from more2_jax.network.local_field import (
+    LEAST_SHARE,
+    MIN_VARIANCE,
+    NORMAL_FEATURES,
+    PLANE_REACH,
+    LocalLookup,
+    local_width,
+    plane_features,
+    plane_offsets,
+    plane_rows,
+)
 from more2_jax.network.prior import encode_one, init_prior, sdf_one
 from more2_jax.types import Anchors
 from train.run.settings import TrainingRun
@@ -41,7 +51,7 @@ def lookup():
     @jax.jit
     def asked(params, anchors: Anchors, scale: jax.Array, q: jax.Array) -> jax.Array:
         bound = module.bind(params)
-        return bound.query(bound.tabulate(anchors, scale), q)
+        return bound.query(bound.tabulate(anchors, scale), q)[0]
 
     def ask(anchors: Anchors, scale: float, q: np.ndarray) -> np.ndarray:
         return np.asarray(asked(params, anchors, jnp.float32(scale), jnp.asarray(q, jnp.float32)))
@@ -171,3 +181,144 @@ def test_gradients_are_finite_with_few_real_points(prior, cloud):
     gradient = jax.device_get(gradient)
     assert all(np.isfinite(g).all() for g in jax.tree.leaves(gradient))
     assert float(np.abs(gradient[0]["decoder"]["local_1"]["slope"]).max()) > 0
+
+
+# --- normals ------------------------------------------------------------------------------------------------
+
+
+placed, field = quick_jit(encode_one), quick_jit(sdf_one)
+
+
+def weights_of(q, position, bandwidth=0.1):
+    """The blend's weights, every row summing to 1."""
+    squared = jnp.sum((q[:, None] - position) ** 2, axis=-1)
+    return jax.nn.softmax(-squared / (2 * bandwidth**2), axis=-1)
+
+
+def asked_planes(q, position, normal, near=0.015):
+    weight = weights_of(q, position)
+    found = plane_features(q, weight, plane_rows(position, normal), jnp.float32(near), weight @ position)
+    return np.asarray(found, np.float64)
+
+
+def unit_rows(rng, count):
+    rows = rng.normal(size=(count, 3))
+    return rows / np.linalg.norm(rows, axis=1, keepdims=True)
+
+
+def planes_one_by_one(q, position, normal, near=0.015):
+    """Every query and every anchor of known normal in a loop, heights by subtraction, float64."""
+    rows = []
+    for p, w in zip(
+        q, np.asarray(weights_of(jnp.asarray(q), jnp.asarray(position)), np.float64), strict=True
+    ):
+        known = [j for j in range(len(position)) if normal[j].any()]
+        heights = {j: normal[j] @ (p - position[j]) for j in known}
+
+        def blend(v, heights=heights, known=known, p=p):
+            share = sum(v[j] for j in known)
+            mean = sum((v[j] * normal[j] for j in known), np.zeros(3)) / (share + LEAST_SHARE)
+            return sum(v[j] * heights[j] for j in known) / (share + LEAST_SHARE), mean, share
+
+        first, n, share = blend(w)
+        near_weight = {j: w[j] * np.exp(-(heights[j] ** 2) / (2 * near**2)) for j in known}
+        second, n_near, near_share = blend(near_weight)
+        spread = np.sqrt(sum(w[j] * heights[j] ** 2 for j in known) / (share + LEAST_SHARE))
+        rows.append(
+            [
+                share,
+                first,
+                first / (abs(first) + PLANE_REACH),
+                n @ (p - w @ position),
+                spread * share / (share + LEAST_SHARE),
+                first / (spread + PLANE_REACH),
+                np.linalg.norm(n) * share / (share + LEAST_SHARE),
+                near_share,
+                second,
+                second / (abs(second) + PLANE_REACH / 2),
+                np.linalg.norm(n_near) * share / (share + LEAST_SHARE),
+            ]
+        )
+    return np.array(rows)
+
+
+def test_plane_features_are_the_sums_over_known_anchors():
+    rng = np.random.default_rng(0)
+    q, position, normal = rng.uniform(-0.5, 0.5, (20, 3)), rng.uniform(-0.4, 0.4, (30, 3)), unit_rows(rng, 30)
+    normal[rng.random(30) < 0.4] = 0
+    got = asked_planes(*(jnp.asarray(x, jnp.float32) for x in (q, position, normal)))
+    assert got.shape == (20, NORMAL_FEATURES)
+    np.testing.assert_allclose(got, planes_one_by_one(q, position, normal), atol=2e-4)
+
+
+def test_nothing_known_is_nothing_said():
+    rng = np.random.default_rng(1)
+    q, position = (jnp.asarray(rng.uniform(-0.5, 0.5, (9, 3)), jnp.float32) for _ in range(2))
+    for normal in (None, jnp.zeros((9, 3))):
+        assert not asked_planes(q, position, normal).any()
+
+
+def test_heights_of_a_thin_board_have_the_sign_of_the_nearer_side():
+    """Two sheets 0.03 apart facing away from one another: inside both blends are negative, outside positive."""
+    side = np.stack(np.meshgrid(*[np.linspace(-0.3, 0.3, 25)] * 2), axis=-1).reshape(-1, 2)
+    sheets = [np.c_[side, np.full(len(side), z)] for z in (-0.015, 0.015)]
+    position = jnp.asarray(np.concatenate(sheets), jnp.float32)
+    normal = jnp.asarray(np.repeat([[0.0, 0, -1], [0, 0, 1]], len(side), axis=0), jnp.float32)
+    z = np.array([-0.05, -0.025, -0.01, 0.0, 0.01, 0.025, 0.05])
+    found = asked_planes(jnp.asarray(np.c_[0.01 + 0 * z, 0.02 + 0 * z, z], jnp.float32), position, normal)
+    inside = np.abs(z) < 0.015
+    assert (found[inside][:, [1, 8]] < 0).all()
+    assert (found[~inside][:, 8] > 0).all()
+    # Outward turned inward changes the sign of every height and nothing else.
+    turned = asked_planes(jnp.asarray(np.c_[0.01 + 0 * z, 0.02 + 0 * z, z], jnp.float32), position, -normal)
+    sign = np.array([1, -1, -1, -1, 1, -1, 1, 1, -1, -1, 1])
+    np.testing.assert_allclose(turned, sign * found, atol=1e-5)
+
+
+@pytest.fixture(scope="module")
+def seeing():
+    """A small random prior whose decoder looks normals up."""
+    model = load_config(ROOT / "configs" / "tiny.yaml", TrainingRun).model
+    decoder = dataclasses.replace(
+        model.decoder,
+        narrow_skip=False,
+        local_blocks=(1, 3),
+        local_channels=4,
+        bandwidths=(0.1,),
+        normals=True,
+    )
+    return init_prior(dataclasses.replace(model, decoder=decoder), jax.random.key(3))
+
+
+def test_a_field_with_normals_moves_with_the_object_and_depends_on_them(seeing, cloud):
+    normals = jnp.asarray(unit_rows(np.random.default_rng(5), len(cloud)), jnp.float32).at[::3].set(0.0)
+    T = jaxlie.SE3.from_rotation_and_translation(
+        jaxlie.SO3.sample_uniform(jax.random.key(0)), jnp.array([3.0, -2.0, 1.0])
+    )
+    mask, queries = jnp.ones(len(cloud), bool), 1.2 * cloud[:40]
+    embedding = placed(seeing, cloud, mask, normals)
+    expected = field(seeing, embedding, queries)
+    turned = jax.vmap(lambda n: T.rotation() @ n)(normals)
+    moved = jax.vmap(lambda p: T @ (2.5 * p))
+    again = placed(seeing, moved(cloud), mask, turned)
+    np.testing.assert_allclose(field(seeing, again, moved(queries)), expected, atol=5e-4)
+    carried = transform(rescale(embedding, 2.5), T)
+    np.testing.assert_allclose(field(seeing, carried, moved(queries)), expected, atol=5e-4)
+    for other in (-normals, jnp.zeros_like(normals)):
+        blind = placed(seeing, cloud, mask, other)
+        assert np.abs(field(seeing, blind, queries) - expected).max() > 1e-3
+        for name in ("inv", "eqv", "scale", "center"):  # codes are of positions alone
+            np.testing.assert_array_equal(getattr(blind, name), getattr(embedding, name))
+
+
+def test_gradients_with_normals_are_finite_where_few_are_known(seeing, cloud):
+    mask, normals = jnp.arange(len(cloud)) < 20, jnp.zeros_like(cloud).at[0, 2].set(1.0)
+
+    def total(params, points, mask, normals):
+        weights = dataclasses.replace(seeing, params=params)
+        return jnp.abs(sdf_one(weights, encode_one(weights, points, mask, normals), points[:30])).sum()
+
+    gradient = quick_jit(jax.grad(total, argnums=(0, 1, 3)))(seeing.params, cloud, mask, normals)
+    gradient = jax.device_get(gradient)
+    assert all(np.isfinite(g).all() for g in jax.tree.leaves(gradient))
+    assert np.abs(gradient[0]["decoder"]["local_1"]["log_near_plane"]) > 0

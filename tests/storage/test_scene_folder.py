@@ -19,7 +19,7 @@ from places import ROOT
 import more2_jax
 from more2_jax.config import preset
 from more2_jax.storage.scene_folder import check_output, load_scene, save_scene, stored_at
-from more2_jax.types import Frame
+from more2_jax.types import Anchors, Frame
 
 CONFIG = preset("robust", upright=True)
 
@@ -48,6 +48,30 @@ def test_round_trip_is_exact(tmp_path):
     assert config == CONFIG
     assert again.objects[0].points.dtype == np.float64
     assert again.objects[0].embedding.inv.dtype == np.float32
+
+
+def with_anchors(scene, normal):
+    """The scene with one level of anchors in every embedding; those of the first object have normals."""
+    objects = []
+    for k, o in enumerate(scene.objects):
+        rng = np.random.default_rng(k)
+        anchors = Anchors(
+            offset=rng.normal(size=(5, 3)).astype(np.float32),
+            features=rng.normal(size=(5, 3, 2)).astype(np.float32),
+            mask=np.arange(5) < 4,
+            normal=np.full((5, 3), normal * (k == 0), np.float32),
+        )
+        objects.append(dataclasses.replace(o, embedding=dataclasses.replace(o.embedding, anchors=(anchors,))))
+    return dataclasses.replace(scene, objects=tuple(objects))
+
+
+@pytest.mark.parametrize("normal", [0.0, 0.6])
+def test_normals_of_anchors_come_back_and_unknown_ones_take_no_place(tmp_path, normal):
+    scene = with_anchors(living_scene(), normal)
+    save_scene(scene, tmp_path / "scene", CONFIG)
+    with np.load(tmp_path / "scene" / "embeddings.npz") as file:
+        assert ("anchors_0_normal" in file.files) == (normal != 0)
+    assert_same(scene, load_scene(tmp_path / "scene")[0])
 
 
 def test_the_frame_of_a_scan_is_that_of_its_observations(tmp_path):

@@ -19,6 +19,7 @@ from train.shards.augmentation import (
     ball,
     behind_an_edge,
     depth_noise,
+    flawed_normals,
     half_space,
     local_piece,
     merge_views,
@@ -56,7 +57,8 @@ def shapes(count: int = 4) -> Shapes:
     sdf = np.linalg.norm(query, axis=-1, keepdims=True) - radius[:, None, None]
     uniform, near = (jnp.asarray(a, jnp.float16) for a in np.concatenate([query, sdf], axis=-1))
     views = direction * radius[:, None, None, None]
-    return Shapes(views=jnp.asarray(views, jnp.float16), sdf_uniform=uniform, sdf_near=near)
+    outward = jnp.asarray(np.rint(127 * direction), jnp.int8)
+    return Shapes(views=jnp.asarray(views, jnp.float16), normals=outward, sdf_uniform=uniform, sdf_near=near)
 
 
 def test_clean_samples_are_points_of_the_chosen_shape():
@@ -126,24 +128,34 @@ def test_a_ball_is_empty_and_nothing_else_is_gone():
 def test_junk_replaces_at_most_15_percent_and_counts_as_kept():
     nothing = jnp.zeros(len(CLOUD), bool)
     other = jax.random.normal(jax.random.key(2), (24, 384, 3))
-    mixed, kept = jax.device_get(each(lambda k: add_junk(k, CLOUD, nothing, other, 1.0)))
+    strange = other.reshape(-1, 3), jnp.broadcast_to(jnp.array([0.0, 0.6, 0.8]), (24 * 384, 3))
+    up = jnp.broadcast_to(jnp.array([0.0, 0.0, 2.0]), CLOUD.shape)  # told by its length from what junk has
+    mixed, normals, kept = jax.device_get(each(lambda k: add_junk(k, CLOUD, up, nothing, strange, 1.0)))
     changed = (mixed != np.asarray(CLOUD)).any(axis=-1)
     np.testing.assert_array_equal(changed, kept)
+    np.testing.assert_array_equal(changed, np.linalg.norm(normals, axis=-1) < 1.5)
     assert 0.13 < changed.mean(axis=1).max() <= MOST_JUNK + 1 / len(CLOUD)
     flat = [
         np.linalg.matrix_rank(m[c] - m[c].mean(axis=0), tol=1e-4) < 3
         for m, c in zip(mixed, changed, strict=True)
     ]
     assert 0.38 < np.mean(flat) < 0.65  # patches of planes; the others are fragments
-    clean, kept = each(lambda k: add_junk(k, CLOUD, nothing, other, 0.0), KEYS[:5])
+    of_fragment = [np.allclose(n[c], [0.0, 0.6, 0.8]) for n, c in zip(normals, changed, strict=True)]
+    enough = changed.sum(axis=1) > 3  # three points always lie in a plane
+    np.testing.assert_array_equal(np.asarray(of_fragment)[enough], ~np.asarray(flat)[enough])
+    clean, normals, kept = each(lambda k: add_junk(k, CLOUD, up, nothing, strange, 0.0), KEYS[:5])
     assert not kept.any()
+    assert (np.asarray(normals) == np.asarray(up)).all()
     assert (np.asarray(clean) == np.asarray(CLOUD)).all()
 
 
 def test_a_fragment_is_the_points_nearest_to_one_of_them():
     other = np.random.default_rng(0).normal(size=(300, 3)).astype(np.float32)
     for key in KEYS[:10]:
-        piece = np.asarray(local_piece(key, CLOUD, jnp.asarray(other), 20))
+        piece, beside = local_piece(key, CLOUD, jnp.asarray(other), jnp.asarray(2 * other), 20)
+        offset = np.asarray(beside - beside[0]) / 2  # rows follow their points
+        np.testing.assert_allclose(offset, np.asarray(piece - piece[0]), atol=2e-6)
+        piece = np.asarray(piece)
         offset = piece - piece[0]  # nearest first: row 0 is the center
         center = min(range(300), key=lambda c: np.abs(nearest_to(other, c, 20) - offset).max())
         np.testing.assert_allclose(offset, nearest_to(other, center, 20), atol=2e-6)
@@ -155,20 +167,23 @@ def nearest_to(points, center, count):
 
 
 def test_a_fragment_of_a_shape_with_fewer_points_repeats_them():
-    piece = local_piece(KEYS[0], CLOUD, jnp.zeros((3, 3)), 10)
+    piece, _ = local_piece(KEYS[0], CLOUD, jnp.zeros((3, 3)), jnp.zeros((3, 3)), 10)
     assert piece.shape == (10, 3)
     assert (np.asarray(piece) == np.asarray(piece[0])).all()
 
 
 def test_planes_are_level_or_upright_and_touch_the_cloud_from_outside():
-    patches = np.asarray(each(lambda k: plane_patch(k, CLOUD, 60)), np.float64)
+    patches, facing = (np.asarray(x, np.float64) for x in each(lambda k: plane_patch(k, CLOUD, 60)))
     floors = 0
-    for patch in patches:
+    for patch, normals in zip(patches, facing, strict=True):
         _, spread, axes = np.linalg.svd(patch - patch.mean(axis=0))
         assert spread[2] < 1e-5 < spread[1]
         normal = axes[2]
         assert min(abs(normal[2]), 1 - abs(normal[2])) < 1e-5
         floors += abs(normal[2]) > 0.5
+        assert np.ptp(normals, axis=0).max() == 0
+        assert abs(normals[0] @ normal) == pytest.approx(1, abs=1e-5)
+        assert ((np.asarray(CLOUD) - patch[0]) @ normals[0]).min() > -1e-5  # toward the cloud
         beyond = (np.asarray(CLOUD) - patch[0]) @ normal
         assert min(abs(beyond.max()), abs(beyond.min())) < 1e-5  # all on one side, one of them on it
         if abs(normal[2]) > 0.5:
@@ -232,14 +247,19 @@ def test_points_in_the_shadow_of_a_depth_edge_are_lost():
 
 def test_one_view_clouds_are_of_one_view():
     views = jnp.broadcast_to(jnp.arange(24.0)[:, None, None], (24, 384, 3))
-    merged, view = each(lambda k: merge_views(k, views, 6, 64, 1.0))
+    merged, view, _ = each(lambda k: merge_views(k, views, 6, 64, 1.0))
     assert max(len(np.unique(cloud)) for cloud in np.asarray(merged)) == 1
     np.testing.assert_array_equal(merged[..., 0], view)  # each point names its view
 
 
+def with_normals(views):
+    return views, jnp.zeros(views.shape, jnp.int8)
+
+
 @partial(quick_jit, static_argnames="config")
 def clouds(views, other, config):
-    return jax.vmap(lambda key: partial_cloud(key, views, other, config, 16))(KEYS)
+    seen = with_normals(views), with_normals(other)
+    return jax.vmap(lambda key: partial_cloud(key, *seen, config, 16))(KEYS)
 
 
 def test_flaws_happen_in_augmented_clouds_alone():
@@ -254,8 +274,9 @@ def test_flaws_happen_in_augmented_clouds_alone():
 
 def test_sampling_starts_at_the_kept_point_farthest_out():
     points = jnp.array([[0.0, 0, 0], [9, 0, 0], [0, 2, 0], [0.1, 0, 0]])
-    first, kept = start_far_out(points, jnp.array([True, False, True, True]))
+    first, beside, kept = start_far_out(points, 10 * points, jnp.array([True, False, True, True]))
     np.testing.assert_array_equal(first[0], [0, 2, 0])
+    np.testing.assert_array_equal(beside, 10 * first)
     np.testing.assert_array_equal(kept, [True, False, True, True])
 
 
@@ -267,7 +288,11 @@ def test_flawed_samples_are_finite_and_keep_enough():
 
 def test_a_cloud_that_cuts_would_leave_nothing_of_stays_whole():
     config = dataclasses.replace(UNFLAWED, ball_probability=1.0)
-    cut = quick_jit(jax.vmap(lambda key, views: partial_cloud(key, views, views, config, 200)[1], (0, None)))
+
+    def kept(key, views):
+        return partial_cloud(key, with_normals(views), with_normals(views), config, 200)[2]
+
+    cut = quick_jit(jax.vmap(kept, (0, None)))
     views = shapes().views[3, :4]
     small = cut(KEYS[:20], 0.05 * views).sum(
         axis=1
@@ -287,9 +312,78 @@ def test_samples_follow_the_shapes_when_these_are_permuted():
 def test_a_shape_that_is_one_point_gives_one_kept_point():
     one = Shapes(
         views=jnp.zeros((1, 24, 8, 3), jnp.float16),
+        normals=jnp.zeros((1, 24, 8, 3), jnp.int8),
         sdf_uniform=jnp.ones((1, 9, 4), jnp.float16),
         sdf_near=jnp.ones((1, 9, 4), jnp.float16),
     )
     sample = draw(jax.random.key(0), one, jnp.array([0]), CLEAN, 32)
     np.testing.assert_array_equal(sample.mask.sum(axis=-1), 1)
     assert (sample.points == 0).all()
+
+
+# --- normals ------------------------------------------------------------------------------------------------
+
+UP = jnp.broadcast_to(jnp.array([0.0, 0.0, 1.0]), CLOUD.shape)
+TRUE_NORMALS = dataclasses.replace(
+    CONFIG,
+    normal_noise_deg=0.0,
+    normals_unknown_probability=0.0,
+    normals_lost_probability=0.0,
+    flip_probability=0.0,
+    flipped=0.0,
+)
+
+
+def flawed(**settings):
+    config = dataclasses.replace(TRUE_NORMALS, **settings)
+    return np.asarray(each(lambda k: flawed_normals(k, UP, CLOUD, config, 1.0)), np.float64)
+
+
+def test_normals_of_samples_are_those_of_their_points():
+    """On spheres about the origin a point's normal is its direction, also of fragments that keep their own."""
+    config = dataclasses.replace(TRUE_NORMALS, noise=0.0, augment_probability=0.0)
+    sample = draw(jax.random.key(0), shapes(), jnp.arange(4), config, 64)
+    unit = sample.points / jnp.linalg.norm(sample.points, axis=-1, keepdims=True)
+    np.testing.assert_allclose(sample.normals, unit, atol=0.01)
+
+
+def test_points_of_samples_do_not_depend_on_what_befalls_normals():
+    drawn = [draw(jax.random.key(0), shapes(), jnp.arange(4), c, 64) for c in (CONFIG, UNFLAWED_NORMALS)]
+    np.testing.assert_array_equal(drawn[0].points, drawn[1].points)
+    assert not np.array_equal(drawn[0].normals, drawn[1].normals)
+
+
+UNFLAWED_NORMALS = dataclasses.replace(CONFIG, normal_noise_deg=0.0, normals_unknown_probability=0.0)
+
+
+def test_flawed_normals_have_unit_length_or_none():
+    found = np.asarray(each(lambda k: flawed_normals(k, UP, CLOUD, CONFIG, 1.0)))
+    length = np.linalg.norm(found, axis=-1)
+    assert (np.isclose(length, 1, atol=1e-5) | (length == 0)).all()
+    nowhere = (length == 0).all(axis=1).mean()
+    assert nowhere == pytest.approx(CONFIG.normals_unknown_probability, abs=0.11)
+    np.testing.assert_array_equal(flawed(), np.broadcast_to(UP, found.shape))
+
+
+def test_normals_tilt_by_their_noise():
+    tilt = np.rad2deg(np.arccos(np.clip(flawed(normal_noise_deg=5.0)[..., 2], -1, 1)))
+    rms = np.sqrt((tilt**2).mean(axis=1) / 2)  # of each of two ways
+    assert rms.min() > 0.9 * 0.3 * 5
+    assert rms.max() < 1.1 * 1.7 * 5
+    assert np.mean(rms) == pytest.approx(5.0, rel=0.1)
+
+
+def test_inward_normals_fill_a_ball_or_are_strewn():
+    inward = flawed(flip_probability=1.0)[..., 2] < 0
+    points = np.asarray(CLOUD)
+    for row in inward:
+        assert row.any() and np.linalg.norm(points[row] - points[row].mean(axis=0), axis=1).max() < 0.4
+    assert (flawed(flipped=0.1)[..., 2] < 0).mean() == pytest.approx(0.1, abs=0.01)
+
+
+def test_lost_normals_are_up_to_half_and_unknown_ones_stay_so():
+    lost = (flawed(normals_lost_probability=1.0) == 0).all(axis=-1).mean(axis=1)
+    assert lost.mean() == pytest.approx(0.25, abs=0.04)
+    assert lost.max() < 0.6
+    zeros = each(lambda k: flawed_normals(k, 0 * UP, CLOUD, CONFIG, 1.0))
+    assert not np.asarray(zeros).any()

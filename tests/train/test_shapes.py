@@ -138,12 +138,14 @@ def test_viewpoints_surround_the_shape():
 
 
 def test_views_see_the_near_side_of_the_surface_and_no_other():
-    views = depth_views(*sphere(0.45, subdivisions=5), np.random.default_rng(0))
-    assert views.shape == (VIEWS, POINTS_A_VIEW, 3)
+    views, normals = depth_views(*sphere(0.45, subdivisions=5), np.random.default_rng(0))
+    assert views.shape == normals.shape == (VIEWS, POINTS_A_VIEW, 3)
     np.testing.assert_allclose(np.linalg.norm(views, axis=-1), 0.45, atol=1e-3)
     height = np.einsum("vnc,vc->vn", views, view_directions())
     assert height.min() > 0.45**2 / 1.6 - 0.01  # the horizon seen from 1.6
     assert (height.max(axis=1) > 0.445).all()
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=-1), 1)
+    assert np.einsum("vnc,vnc->vn", views, normals).min() > 0.45 * 0.999  # outward, along the radius
 
 
 def test_coverage_is_the_share_of_the_visible_surface_that_was_seen():
@@ -157,7 +159,7 @@ def test_coverage_is_the_share_of_the_visible_surface_that_was_seen():
 
 def test_a_slender_shape_repeats_points_and_one_too_slender_is_refused():
     rod = trimesh.creation.box((0.02, 0.02, 0.9))
-    views = depth_views(
+    views, _ = depth_views(
         np.asarray(rod.vertices), np.asarray(rod.faces), np.random.default_rng(0), fewest_hits=1
     )
     distinct = [len(np.unique(view, axis=0)) for view in views]

@@ -32,10 +32,10 @@ def held_out(prior: Prior, shapes: Shapes, config: TrainingConfig, count: int) -
     Takes `count` shapes spread evenly; the same at every call.
     """
     index = jnp.asarray(np.linspace(0, len(shapes.views) - 1, min(count, len(shapes.views))).astype(int))
-    clean = dataclasses.replace(config, max_views=3, augment_probability=0.0)
+    clean = dataclasses.replace(config, max_views=3, augment_probability=0.0, normals_unknown_probability=0.0)
     sample = sample_batch(jax.random.key(2), shapes, index, clean, prior.config.encoder.points)
-    embeddings = jax.jit(jax.vmap(lambda p, m: encode_ordered(prior, p, m)))(
-        sample.points[:, 0], sample.mask[:, 0]
+    embeddings = jax.jit(jax.vmap(lambda p, m, n: encode_ordered(prior, p, m, n)))(
+        sample.points[:, 0], sample.mask[:, 0], sample.normals[:, 0]
     )
     rows = []
     for i, shape in enumerate(index):

@@ -25,8 +25,13 @@ def started_cold(settings: TrainingRun, train: ShapeMix, name: str) -> Prior:
 
 
 def started_warm(model: PriorConfig, weights: str, name: str) -> Prior:
-    """Weights that were trained before. Raises ValueError if they are not of this model."""
+    """Weights that were trained before; of a decoder without normals, with new rows of zeros where it is to see them.
+
+    Raises ValueError if they are not of this model.
+    """
     prior = load_prior(weights)
+    if model.decoder.normals and not prior.config.decoder.normals:
+        prior = seeing_normals(prior)
     scale = prior.config.encoder.output_scale  # measured at the start of their training, and theirs for good
     wanted = dataclasses.replace(model, encoder=dataclasses.replace(model.encoder, output_scale=scale))
     if different := [
@@ -39,6 +44,20 @@ def started_warm(model: PriorConfig, weights: str, name: str) -> Prior:
             f" {getattr(wanted, different[0])}, as configured"
         )
     return dataclasses.replace(prior, name=name)
+
+
+def seeing_normals(prior: Prior) -> Prior:
+    """The same distances from a decoder that looks up normals: what it reads of them has weights of zero."""
+    decoder = dataclasses.replace(prior.config.decoder, normals=True)
+    config = dataclasses.replace(prior.config, decoder=decoder)
+    fresh = init_prior(config, jax.random.key(0)).params["decoder"]
+    known = prior.params["decoder"]
+    params = {name: part | known[name] for name, part in fresh.items()}
+    for name in ("layer_0", f"layer_{decoder.skip_layer}"):
+        old = known[name]["direction"]
+        more = len(fresh[name]["direction"]) - len(old)
+        params[name] |= {"direction": jnp.pad(old, ((0, more), (0, 0)))}  # columns keep their lengths
+    return dataclasses.replace(prior, params=prior.params | {"decoder": params}, config=config)
 
 
 def calibrated(model: PriorConfig, training: TrainingConfig, train: ShapeMix) -> PriorConfig:

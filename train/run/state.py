@@ -45,9 +45,14 @@ def initial_state(prior: Prior, config: TrainingConfig) -> TrainingState:
     return TrainingState(
         params=jax.tree.map(jnp.copy, prior.params),  # a step takes the old state's memory
         average=jax.tree.map(jnp.copy, prior.params),
-        optimizer=optimizer(config).init(prior.params),
+        optimizer=optimizer(config).init(trained(prior.params, config)),
         step=jnp.zeros((), jnp.int32),
     )
+
+
+def trained(params: dict[str, Any], config: TrainingConfig) -> dict[str, Any]:
+    """The weights that steps change."""
+    return params if config.train == "all" else {"decoder": params["decoder"]}
 
 
 def draw(
@@ -82,21 +87,23 @@ def training_step(
     """
     sample, dropout_key = draw(shapes, index, state.step, model, config, mesh)
 
+    # Of weights that stay nothing is differentiated, which for the encoder is most of a step.
     def loss(params: dict[str, Any]) -> tuple[Array, dict[str, Array]]:
-        prior = Prior(params=params, config=model)
+        prior = Prior(params=state.params | params, config=model)
         return total_loss(prior, sample, config, dropout_key, mesh)
 
-    gradient, terms = jax.grad(loss, has_aux=True)(state.params)
-    updates, opt_state = optimizer(config).update(gradient, state.optimizer, state.params)
-    params = optax.apply_updates(state.params, updates)
+    before, average = trained(state.params, config), trained(state.average, config)
+    gradient, terms = jax.grad(loss, has_aux=True)(before)
+    updates, opt_state = optimizer(config).update(gradient, state.optimizer, before)
+    params: dict[str, Any] = optax.apply_updates(before, updates)  # pyright: ignore[reportAssignmentType]
     # Early on the average follows quickly, or it would remember the random start for long.
     keep = jnp.minimum(config.ema, (1 + state.step) / (10 + state.step))
-    average = jax.tree.map(lambda old, new: keep * old + (1 - keep) * new, state.average, params)
+    average = jax.tree.map(lambda old, new: keep * old + (1 - keep) * new, average, params)
     terms = terms | {"gradient": optax.global_norm(gradient)}
     return dataclasses.replace(
         state,
-        params=params,  # pyright: ignore[reportArgumentType]
-        average=average,
+        params=state.params | params,
+        average=state.average | average,
         optimizer=opt_state,
         step=state.step + 1,
     ), terms

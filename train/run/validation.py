@@ -7,6 +7,7 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 from jax import Array
+from jaxtyping import Float
 
 from more2_jax.geometry.points import kabsch_rotation
 from more2_jax.network.prior import Prior
@@ -21,8 +22,13 @@ BATCH = 32
 
 
 def validate(prior: Prior, shapes: Shapes, config: TrainingConfig) -> dict[str, float]:
-    """Means over up to `MOST_VALIDATED` shapes, clean clouds of up to three views: the same samples at every call."""
-    clean = dataclasses.replace(config, max_views=3, augment_probability=0.0, queries=1024)
+    """Means over up to `MOST_VALIDATED` shapes, clean clouds of up to three views: the same samples at every call.
+
+    Where the decoder looks up normals, `bare_*` are the scores of the same clouds without them.
+    """
+    clean = dataclasses.replace(
+        config, max_views=3, augment_probability=0.0, normals_unknown_probability=0.0, queries=1024
+    )
     count = min(MOST_VALIDATED, len(shapes.views)) // GROUP * GROUP
     batch = min(BATCH, count)
     rows = [
@@ -46,20 +52,32 @@ def _scores(
     return _sample_scores(prior, sample)
 
 
+def field_scores(
+    predicted: Float[Array, "b 2 q"], truth: Float[Array, "b 2 q"]
+) -> dict[str, Float[Array, " b"]]:
+    """Error of the distance, and share of right signs among the second half of the queries, near the surface."""
+    sign = (predicted < 0) == (truth < 0)
+    return {
+        "sdf_l1": jnp.abs(predicted - truth).mean(axis=(1, 2)),
+        "near_sign": sign[..., truth.shape[-1] // 2 :].mean(axis=(1, 2)),
+    }
+
+
 @jax.jit
 def _sample_scores(prior: Prior, sample: TrainingSample) -> dict[str, Array]:
     embedding, predicted = predict(prior, sample, jax.random.key(0), train=False)
-    half = sample.sdf.shape[-1] // 2
-    sign = (predicted < 0) == (sample.sdf < 0)
+    scores = field_scores(predicted, sample.sdf)
+    if prior.config.decoder.normals:
+        blind = dataclasses.replace(sample, normals=jnp.zeros_like(sample.normals))
+        _, predicted = predict(prior, blind, jax.random.key(0), train=False)
+        scores |= {f"bare_{k}": v for k, v in field_scores(predicted, sample.sdf).items()}
     inv = embedding.inv / jnp.linalg.norm(embedding.inv, axis=-1, keepdims=True)
     inv = inv.reshape(-1, GROUP, *inv.shape[1:])
     cosine = jnp.einsum("gic,gjc->gij", inv[:, :, 0], inv[:, :, 1])
     rotation = jax.vmap(lambda e: kabsch_rotation(e[0].T, e[1].T).as_matrix())(embedding.eqv)
     trace = jnp.trace(rotation, axis1=-2, axis2=-1)
     angle_deg = jnp.rad2deg(jnp.arccos(jnp.clip((trace - 1) / 2, -1, 1)))
-    return {
-        "sdf_l1": jnp.abs(predicted - sample.sdf).mean(axis=(1, 2)),
-        "near_sign": sign[..., half:].mean(axis=(1, 2)),
+    return scores | {
         "matching": (jnp.argmax(cosine, axis=-1) == jnp.arange(GROUP)).reshape(-1),
         "kabsch_10deg": angle_deg < 10,
         "kabsch_deg": angle_deg,

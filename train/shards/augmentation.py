@@ -17,6 +17,7 @@ from train.shards.view_directions import DISTANCE, HALF_FIELD, view_directions
 
 Cloud = Float[Array, "n 3"]
 Kept = Bool[Array, " n"]
+Seen = tuple[Float[Array, "m 3"], Float[Array, "m 3"]]  # points of a shape, and the unit normals there
 Chance = float | Float[Array, ""]
 
 MOST_JUNK = 0.15  # share of the rows
@@ -27,15 +28,18 @@ EDGE_JUMP = 0.1  # a point so far behind another of its cell stands at a depth e
 
 def merge_views(
     key: Array, views: Float[Array, "v n 3"], max_views: int, count: int, one_view: Chance = 0.0
-) -> tuple[Cloud, Int[Array, " n"]]:
-    """`count` points drawn from 1 to `max_views` random views, and the view of each; `one_view`: P(just one)."""
+) -> tuple[Cloud, Int[Array, " n"], Int[Array, " n"]]:
+    """`count` points drawn from 1 to `max_views` random views, and view and place there of each.
+
+    `one_view`: the probability of just one.
+    """
     number_key, view_key, row_key, point_key, one_key = jax.random.split(key, 5)
     number = jax.random.randint(number_key, (), 1, max_views + 1)
     number = jnp.where(jax.random.bernoulli(one_key, one_view), 1, number)
     chosen = jax.random.randint(view_key, (max_views,), 0, views.shape[0])
     view = chosen[jax.random.randint(row_key, (count,), 0, number)]
     point = jax.random.randint(point_key, (count,), 0, views.shape[1])
-    return views[view, point].astype(jnp.float32), view
+    return views[view, point].astype(jnp.float32), view, point
 
 
 def depth_noise(
@@ -92,18 +96,25 @@ def ball(key: Array, points: Cloud, probability: Chance) -> Kept:
 
 
 def add_junk(
-    key: Array, points: Cloud, kept: Kept, other: Float[Array, "v m 3"], probability: Chance
-) -> tuple[Cloud, Kept]:
-    """Replaces up to 15 % of the rows by a piece of another shape or by a patch of floor or wall, one half each."""
+    key: Array, points: Cloud, normals: Cloud, kept: Kept, other: Seen, probability: Chance
+) -> tuple[Cloud, Cloud, Kept]:
+    """Replaces up to 15 % of the rows by a piece of another shape or by a patch of floor or wall, one half each.
+
+    Junk has its own true normals, as in a scan: it is not told by them.
+    """
     happens_key, kind_key, count_key, fragment_key, plane_key = jax.random.split(key, 5)
     most = fragment_rows(len(points))
-    fragment = local_piece(fragment_key, points, other.reshape(-1, 3), most)
+    fragment = local_piece(fragment_key, points, *other, most)
     patch = plane_patch(plane_key, points, most)
-    junk = jnp.where(jax.random.bernoulli(kind_key), fragment, patch)
+    is_fragment = jax.random.bernoulli(kind_key)
+    junk, of_junk = (jnp.where(is_fragment, a, b) for a, b in zip(fragment, patch, strict=True))
     share = jax.random.uniform(count_key, maxval=MOST_JUNK) * jax.random.bernoulli(happens_key, probability)
     is_junk = jnp.arange(len(points)) < share * len(points)
-    mixed = jnp.where(is_junk[:most, None], junk, points[:most])
-    return points.at[:most].set(mixed), kept | is_junk
+
+    def mixed(rows: Cloud, of_junk: Cloud) -> Cloud:
+        return rows.at[:most].set(jnp.where(is_junk[:most, None], of_junk, rows[:most]))
+
+    return mixed(points, junk), mixed(normals, of_junk), kept | is_junk
 
 
 def fragment_rows(rows: int) -> int:
@@ -111,24 +122,32 @@ def fragment_rows(rows: int) -> int:
     return int(np.ceil(MOST_JUNK * rows))
 
 
-def local_piece(key: Array, points: Cloud, other: Float[Array, "m 3"], count: int) -> Float[Array, "count 3"]:
+def local_piece(
+    key: Array, points: Cloud, other: Float[Array, "m 3"], normals: Float[Array, "m 3"], count: int
+) -> tuple[Float[Array, "count 3"], Float[Array, "count 3"]]:
     """The `count` points of `other` nearest to a random one of them, nearest first, moved beside `points`.
 
-    They are sought among `FRAGMENT_POOL` random points of it (all, if there are no more).
+    Their normals, too. They are sought among `FRAGMENT_POOL` random points of it (all, if there are no more).
     """
     from_key, to_key, shift_key, pool_key = jax.random.split(key, 4)
     if len(other) > FRAGMENT_POOL:
-        other = other[jax.random.randint(pool_key, (FRAGMENT_POOL,), 0, len(other))]
+        pool = jax.random.randint(pool_key, (FRAGMENT_POOL,), 0, len(other))
+        other, normals = other[pool], normals[pool]
     other = other.astype(jnp.float32)
     offset = other - other[jax.random.randint(from_key, (), 0, len(other))]
     _, nearest = jax.lax.top_k(-jnp.sum(offset * offset, axis=-1), min(count, len(other)))
     beside = points[jax.random.randint(to_key, (), 0, len(points))]
     piece = beside + 0.15 * jax.random.normal(shift_key, (3,)) + offset[nearest]
-    return jnp.resize(piece, (count, 3))
+    return jnp.resize(piece, (count, 3)), jnp.resize(normals[nearest], (count, 3))
 
 
-def plane_patch(key: Array, points: Cloud, count: int) -> Float[Array, "count 3"]:
-    """A rectangle of floor (half the time) or of an upright wall that touches the cloud from outside; z is up."""
+def plane_patch(
+    key: Array, points: Cloud, count: int
+) -> tuple[Float[Array, "count 3"], Float[Array, "count 3"]]:
+    """A rectangle of floor (half the time) or of an upright wall that touches the cloud from outside; z is up.
+
+    Also its normal at every point, which faces the cloud.
+    """
     kind_key, turn_key, beside_key, size_key, place_key = jax.random.split(key, 5)
     turn = jax.random.uniform(turn_key, maxval=2 * jnp.pi)
     across = jnp.stack([jnp.cos(turn), jnp.sin(turn), 0.0])
@@ -140,12 +159,31 @@ def plane_patch(key: Array, points: Cloud, count: int) -> Float[Array, "count 3"
     center = beside + outward * ((points - beside) @ outward).max()
     half = jax.random.uniform(size_key, (2,), minval=0.1, maxval=0.5)
     place = half * jax.random.uniform(place_key, (count, 2), minval=-1.0, maxval=1.0)
-    return center + place[:, :1] * level + place[:, 1:] * second
+    patch = center + place[:, :1] * level + place[:, 1:] * second
+    return patch, jnp.broadcast_to(-outward, patch.shape)
 
 
-def start_far_out(points: Cloud, kept: Kept) -> tuple[Cloud, Kept]:
+def flawed_normals(
+    key: Array, normals: Cloud, points: Cloud, config: SampleConfig, open_to_flaws: Chance
+) -> Cloud:
+    """Normals as fused scans give them: tilted, some inward, some or all of them not known (zeros)."""
+    keys = jax.random.split(key, 8)
+    tilt = jnp.deg2rad(config.normal_noise_deg) * jax.random.uniform(keys[0], minval=0.3, maxval=1.7)
+    tilted = normals + tilt * jax.random.normal(keys[1], normals.shape)
+    tilted /= jnp.sqrt(jnp.maximum(jnp.sum(tilted**2, axis=-1, keepdims=True), 1e-12))
+    inward = ball(keys[2], points, open_to_flaws * config.flip_probability)
+    inward ^= jax.random.bernoulli(keys[3], open_to_flaws * config.flipped, inward.shape)
+    share = jax.random.bernoulli(keys[4], open_to_flaws * config.normals_lost_probability)
+    lost = jax.random.bernoulli(keys[5], share * jax.random.uniform(keys[6], maxval=0.5), inward.shape)
+    lost |= jax.random.bernoulli(keys[7], config.normals_unknown_probability)
+    lost |= ~jnp.any(normals != 0, axis=-1)
+    return jnp.where(lost[:, None], 0.0, jnp.where(inward[:, None], -tilted, tilted))
+
+
+def start_far_out(points: Cloud, normals: Cloud, kept: Kept) -> tuple[Cloud, Cloud, Kept]:
     """Copies the kept point farthest from the mean to row 0, where farthest-point sampling starts."""
     weight = kept / jnp.maximum(kept.sum(), 1)
     distance = jnp.where(kept, jnp.sum((points - weight @ points) ** 2, axis=-1), -1.0)
     first = jnp.argmax(distance)
-    return points.at[0].set(points[first]), kept.at[0].set(True)
+    points, normals = (rows.at[0].set(rows[first]) for rows in (points, normals))
+    return points, normals, kept.at[0].set(True)

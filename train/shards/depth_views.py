@@ -27,19 +27,22 @@ def pixel_rays(toward: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "r 3"]:
 
 def depth_views(
     vertices: Float[np.ndarray, "v 3"], faces: np.ndarray, rng: np.random.Generator, fewest_hits: int = 32
-) -> Float[np.ndarray, "views n 3"]:
-    """Surface points seen from each of `VIEWS` directions, canonical units.
+) -> tuple[Float[np.ndarray, "views n 3"], Float[np.ndarray, "views n 3"]]:
+    """Surface points seen from each of `VIEWS` directions, canonical units, and their unit normals, outward.
 
     Raises ValueError if a view sees less than `fewest_hits`.
     """
-    caster = RayMeshIntersector(trimesh.Trimesh(vertices, faces, process=False))
-    views = []
+    mesh = trimesh.Trimesh(vertices, faces, process=False)
+    caster, outward = RayMeshIntersector(mesh), np.asarray(mesh.face_normals)
+    views, normals = [], []
     for toward in view_directions():
-        hits, _ = view_hits(caster, toward)
+        hits, hit_faces = view_hits(caster, toward)
         if len(hits) < fewest_hits:
             raise ValueError(f"a view has {len(hits)} hits; needed {fewest_hits}")
-        views.append(hits[rng.choice(len(hits), POINTS_A_VIEW, replace=len(hits) < POINTS_A_VIEW)])
-    return np.stack(views)
+        chosen = rng.choice(len(hits), POINTS_A_VIEW, replace=len(hits) < POINTS_A_VIEW)
+        views.append(hits[chosen])
+        normals.append(outward[hit_faces[chosen]])
+    return np.stack(views), np.stack(normals)
 
 
 def view_hits(

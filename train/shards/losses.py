@@ -91,6 +91,20 @@ def total_loss(
     embedding, predicted = predict(prior, sample, dropout_key, train=True, mesh=mesh)
     terms = {
         "sdf": sdf_loss(predicted, sample.sdf, config.near_surface),
+        "sign": sign_loss(predicted, sample.sdf, config.sign_width),
+    }
+    terms |= {} if config.train == "decoder" else code_terms(embedding, config)
+    return sum((weight_of(k, config) * v for k, v in terms.items()), jnp.zeros(())), terms
+
+
+def weight_of(term: str, config: LossConfig) -> float:
+    """Of a term in the loss; that of the distance is the unit."""
+    return 1.0 if term == "sdf" else getattr(config, f"{term}_weight")
+
+
+def code_terms(embedding: Embedding, config: LossConfig) -> dict[str, Float[Array, ""]]:
+    """The terms that say what codes should be."""
+    return {
         "center": jnp.mean(jnp.linalg.norm(embedding.center + 1e-12, axis=-1)),
         # Where the paper has |1 − F_s|: the same minimum and slope there, but a scale that shrinks toward 0,
         # where |1 − F_s| has no pull left on the product of all layers, is pushed back.
@@ -98,20 +112,8 @@ def total_loss(
         "contrast": contrast_loss(embedding.inv[:, 0], embedding.inv[:, 1], config.contrast_temperature),
         "turn": turn_loss(embedding.eqv),
         "rotation": rotation_loss(embedding.eqv),
-        "sign": sign_loss(predicted, sample.sdf, config.sign_width),
         "up": up_loss(embedding.eqv),
     }
-    weights = {
-        "sdf": 1.0,
-        "center": config.center_weight,
-        "scale": config.scale_weight,
-        "contrast": config.contrast_weight,
-        "turn": config.turn_weight,
-        "rotation": config.rotation_weight,
-        "sign": config.sign_weight,
-        "up": config.up_weight,
-    }
-    return sum((weights[k] * v for k, v in terms.items()), jnp.zeros(())), terms
 
 
 def predict(
@@ -120,14 +122,14 @@ def predict(
     """Encodes both clouds of every shape and decodes the queries with each cloud's own code."""
     decoder = Decoder(prior.config)
 
-    def one(params: dict[str, Any], cloud: tuple[Array, Array, Array, Array]) -> tuple[Embedding, Array]:
-        points, mask, queries, key = cloud
-        e = encode_ordered(dataclasses.replace(prior, params=params), points, mask)
+    def one(params: dict[str, Any], cloud: tuple[Array, ...]) -> tuple[Embedding, Array]:
+        points, mask, normals, queries, key = cloud
+        e = encode_ordered(dataclasses.replace(prior, params=params), points, mask, normals)
         weights = {"params": params["decoder"]}
         return e, decoder.apply(weights, e, queries, train, rngs={"dropout": key})  # type: ignore[return-value]
 
     keys = jax.random.split(dropout_key, sample.sdf.shape[:2])
-    by_shape = (sample.points, sample.mask, sample.queries, keys)
+    by_shape = (sample.points, sample.mask, sample.normals, sample.queries, keys)
     clouds = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), by_shape)
     found = in_turn(one, prior.params, clouds, max(1, AT_ONCE // sample.points.shape[2]), mesh)
     return jax.tree.map(lambda x: x.reshape(-1, 2, *x.shape[1:]), found)

@@ -1,6 +1,7 @@
 """Training shapes in one small file, to carry where the shards are too large to go.
 
 Coordinates are steps of a cube: 256 for points of views, whose noise is coarser, 4096 for queries and distances.
+Normals are a byte a coordinate as they are in shards.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, UInt16
 
-from train.shards.shards import MAPPED, Shapes
+from train.shards.shards import Shapes
 
 HALF = 0.7  # canonical units: half the cube; shapes reach 0.45, queries and distances a little further
 LEVELS = {"views": 2**8, "sdf_uniform": 2**12, "sdf_near": 2**12}
@@ -30,17 +31,16 @@ def from_steps(steps: UInt16[np.ndarray, "..."], levels: int) -> Float[np.ndarra
 
 
 def write_shapes(path: Path, splits: Mapping[str, Mapping[str, np.ndarray]]) -> None:
-    """Writes the arrays `views`, `sdf_uniform` and `sdf_near` of every split into one .npz."""
-    stored = {}
+    """Writes the arrays `views`, `normals`, `sdf_uniform` and `sdf_near` of every split into one .npz."""
+    stored: dict[str, np.ndarray] = {}
     for split, arrays in splits.items():
-        for name in MAPPED:
-            steps = to_steps(arrays[name], LEVELS[name])
+        stored[f"{split}/normals"] = arrays["normals"]
+        for name, levels in LEVELS.items():
+            steps = to_steps(arrays[name], levels)
             stored[f"{split}/{name}/low"] = (steps & 255).astype(np.uint8)
-            if (
-                LEVELS[name] > 256
-            ):  # a plane of their own, which compresses; mixed with the low bits they do not
+            if levels > 256:  # a plane of their own, which compresses; mixed with the low bits they do not
                 stored[f"{split}/{name}/high"] = (steps >> 8).astype(np.uint8)
-    np.savez_compressed(path, **stored)
+    np.savez_compressed(path, **stored)  # type: ignore[arg-type]
 
 
 def read_shapes(path: Path, split: str) -> Shapes:
@@ -52,10 +52,11 @@ def read_shapes(path: Path, split: str) -> Shapes:
         raise ValueError(
             f"{path}: not a readable .npz ({error}); `python -m train.tools.pack` makes one"
         ) from error
-    if missing := [name for name in MAPPED if f"{split}/{name}/low" not in arrays]:
+    if missing := [name for name in LEVELS if f"{split}/{name}/low" not in arrays]:
         raise ValueError(f"{path}: no {split}/{missing[0]}; `python -m train.tools.pack` makes such files")
-    read = {name: _array(arrays, f"{split}/{name}", LEVELS[name]) for name in MAPPED}
-    return Shapes(**read)  # pyright: ignore[reportArgumentType]
+    read = {name: _array(arrays, f"{split}/{name}", levels) for name, levels in LEVELS.items()}
+    normals = arrays.get(f"{split}/normals", np.zeros(read["views"].shape, np.int8))  # zeros: not known
+    return Shapes(**read, normals=normals)  # pyright: ignore[reportArgumentType]
 
 
 def _array(arrays: Mapping[str, np.ndarray], name: str, levels: int) -> Float[np.ndarray, "..."]:

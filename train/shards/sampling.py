@@ -8,9 +8,9 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 from jax import Array
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Int8
 
-from more2_jax.geometry.points import farthest_points
+from more2_jax.geometry.points import cleared, farthest_rows
 from more2_jax.types import pytree
 from train.shards.augmentation import (
     Cloud,
@@ -18,13 +18,17 @@ from train.shards.augmentation import (
     add_junk,
     ball,
     depth_noise,
+    flawed_normals,
     half_space,
     merge_views,
     start_far_out,
 )
-from train.shards.settings import SampleConfig
+from train.shards.settings import NORMAL_STEPS, SampleConfig
 from train.shards.shards import Shapes
 
+Views = tuple[
+    Float[Array, "v n 3"], Int8[Array, "v n 3"]
+]  # points and normals of one shape, as shards hold them
 LEAST_KEPT = 0.1  # of the points: a cloud of which cuts would leave less stays whole
 
 
@@ -38,6 +42,7 @@ class TrainingSample:
     """
 
     points: Float[Array, "*b 2 n 3"]  # canonical units
+    normals: Float[Array, "*b 2 n 3"]  # unit, outward; zeros where not known
     mask: Bool[Array, "*b 2 n"]
     queries: Float[Array, "*b 2 q 3"]
     sdf: Float[Array, "*b 2 q"]
@@ -53,18 +58,19 @@ def sample_batch(
 
     def one(row: Array, i: Array, j: Array) -> TrainingSample:
         pair = jax.random.split(jax.random.fold_in(key, row))
-        return jax.vmap(lambda k: _half_sample(k, shapes, i, shapes.views[j], config, points))(pair)
+        return jax.vmap(lambda k: _half_sample(k, shapes, i, j, config, points))(pair)
 
     return jax.vmap(one)(jnp.arange(len(index)), index, jnp.roll(index, 1))
 
 
 def _half_sample(
-    key: Array, shapes: Shapes, index: Int[Array, ""], other: Array, config: SampleConfig, count: int
+    key: Array, shapes: Shapes, index: Int[Array, ""], other: Int[Array, ""], config: SampleConfig, count: int
 ) -> TrainingSample:
     cloud_key, query_key = jax.random.split(key)
-    points, mask = partial_cloud(cloud_key, shapes.views[index], other, config, count)
+    seen = (shapes.views[index], shapes.normals[index]), (shapes.views[other], shapes.normals[other])
+    points, normals, mask = partial_cloud(cloud_key, *seen, config, count)
     queries, sdf = _queries(query_key, shapes, index, config.queries)
-    return TrainingSample(points=points, mask=mask, queries=queries, sdf=sdf)
+    return TrainingSample(points=points, normals=normals, mask=mask, queries=queries, sdf=sdf)
 
 
 def _queries(
@@ -79,12 +85,12 @@ def _queries(
 
 
 def partial_cloud(
-    key: Array, views: Float[Array, "v n 3"], other: Array, config: SampleConfig, count: int
-) -> tuple[Cloud, Kept]:
-    """A few views merged, noise, then cuts and junk; `count` points in farthest-point order."""
-    keys = jax.random.split(key, 7)
+    key: Array, seen: Views, other: Views, config: SampleConfig, count: int
+) -> tuple[Cloud, Cloud, Kept]:
+    """A few views merged, noise, then cuts and junk; `count` points in farthest-point order, and their normals."""
+    keys, (views, outward) = jax.random.split(key, 7), seen
     open_to_flaws = jax.random.bernoulli(keys[0], config.augment_probability)
-    points, view = merge_views(
+    points, view, place = merge_views(
         keys[1], views, config.max_views, config.raw_points, open_to_flaws * config.one_view_probability
     )
     points, lost = depth_noise(keys[2], points, view, config, open_to_flaws * config.depth_noise_probability)
@@ -93,5 +99,18 @@ def partial_cloud(
     kept &= ~ball(keys[5], points, open_to_flaws * config.ball_probability)
     # A shelf seen edge-on fits into a ball. What is left of it has no size, and the logarithm of its scale no slope.
     kept = jnp.where(kept.sum() < LEAST_KEPT * len(points), True, kept)
-    points, kept = add_junk(keys[6], points, kept, other, open_to_flaws * config.junk_probability)
-    return farthest_points(*start_far_out(points, kept), count)
+    strange = other[0].reshape(-1, 3), unit(other[1]).reshape(-1, 3)
+    points, normals, kept = add_junk(
+        keys[6], points, unit(outward[view, place]), kept, strange, open_to_flaws * config.junk_probability
+    )
+    # A key of its own: points are what they are without normals.
+    normals = flawed_normals(jax.random.fold_in(key, 7), normals, points, config, open_to_flaws)
+    points, normals, kept = start_far_out(points, normals, kept)
+    points, normals = cleared(points, kept), cleared(normals, kept)
+    index, real = farthest_rows(points, kept, count)
+    return points[index], normals[index], real
+
+
+def unit(steps: Int8[Array, "*n 3"]) -> Float[Array, "*n 3"]:
+    """Normals as shards hold them, to a byte's precision of unit length."""
+    return steps.astype(jnp.float32) / NORMAL_STEPS

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
+
+NORMAL_STEPS = 127  # of a normal's coordinate in shards, one byte; a normal of zeros is not known
 
 
 @dataclass(frozen=True)
@@ -21,12 +24,24 @@ class SampleConfig:
     depth_noise_probability: float = 0.4  # the camera's: along the ray, quantized, with lost edges
     depth_noise: float = 0.002  # standard deviation of inverse depth, 1 / canonical unit
     depth_step: float = 0.002  # of inverse depth
+    normal_noise_deg: float = (
+        10.0  # standard deviation of a normal's tilt, each of two ways; a cloud's own varies
+    )
+    normals_unknown_probability: float = 0.35  # of a cloud to have no normals, be it augmented or not
+    normals_lost_probability: float = (
+        0.5  # up to half of the points have none; of augmented clouds, as is what follows
+    )
+    flip_probability: float = 0.2  # a ball in which normals point inward
+    flipped: float = 0.02  # share of the points whose normals point inward, anywhere
 
 
 @dataclass(frozen=True)
 class LossConfig:
     """Weights of the terms of the training loss, and what they are measured by."""
 
+    train: Literal["all", "decoder"] = (
+        "all"  # decoder: the encoder, hence all codes, stay; nor is any term of them
+    )
     near_surface: float = 0.1  # |SDF| below it weighs 1, else 0.5
     center_weight: float = 0.2
     scale_weight: float = 0.01

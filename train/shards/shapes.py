@@ -12,6 +12,7 @@ from jaxtyping import Float, Int
 from train.furniture.closed_solids import canonical, solidify
 from train.furniture.source_mesh import SourceMesh, check_mesh
 from train.shards.depth_views import coverage, depth_views
+from train.shards.settings import NORMAL_STEPS
 from train.shards.signed_distance import BOX, QUERIES, is_inside, signed_distances
 
 FINGERPRINT_SIDE = 8  # of the grid of distances by which near-duplicates are found
@@ -24,6 +25,9 @@ class Shape:
     vertices: Float[np.ndarray, "v 3"]
     faces: Int[np.ndarray, "f 3"]
     views: Float[np.ndarray, "views n 3"]  # float16, back-projected depth
+    normals: Int[
+        np.ndarray, "views n 3"
+    ]  # int8: outward unit normals there times `NORMAL_STEPS`; 0: not known
     sdf_uniform: Float[np.ndarray, "q 4"]  # float16: x y z and signed distance, negative inside
     sdf_near: Float[np.ndarray, "q 4"]
     fingerprint: Float[np.ndarray, "8 8 8"]  # float16 signed distances on a grid
@@ -42,7 +46,7 @@ def make_shape(mesh: SourceMesh, queries: int = QUERIES) -> Shape:
         raise ValueError("vertices that are not finite; needed numbers")
     solid = solidify(mesh.vertices, mesh.faces)
     vertices, scale = canonical(solid.vertices)
-    views = depth_views(vertices, solid.faces, rng)
+    views, normals = depth_views(vertices, solid.faces, rng)
     uniform, near = signed_distances(vertices, solid.faces, rng, queries)
     meta = {
         "name": mesh.name,
@@ -60,6 +64,7 @@ def make_shape(mesh: SourceMesh, queries: int = QUERIES) -> Shape:
         vertices=vertices,
         faces=solid.faces,
         views=views.astype(np.float16),
+        normals=np.rint(NORMAL_STEPS * normals).astype(np.int8),
         sdf_uniform=uniform,
         sdf_near=near,
         fingerprint=fingerprint(vertices, solid.faces),

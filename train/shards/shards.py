@@ -1,7 +1,7 @@
 """Training shards: folders of arrays, from `python -m train.prepare`, in memory or mapped from disk.
 
-`DIR/shard_000/` holds views.npy, sdf_uniform.npy, sdf_near.npy, fingerprint.npy, meta.json (a row a shape) and
-meshes.npz (the closed solids, packed). `DIR/excluded.json` names shapes that no split may use.
+`DIR/shard_000/` holds views.npy, normals.npy, sdf_uniform.npy, sdf_near.npy, fingerprint.npy, meta.json (a row a
+shape) and meshes.npz (the closed solids, packed). `DIR/excluded.json` names shapes that no split may use.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jax import Array
-from jaxtyping import Float
+from jaxtyping import Float, Int8
 
 from more2_jax.types import pytree
 from train.furniture.packed import read_packed, write_packed
@@ -24,7 +24,7 @@ from train.furniture.source_mesh import SourceMesh
 if TYPE_CHECKING:  # making shapes needs the extra `data`, training on them does not
     from train.shards.shapes import Shape
 
-MAPPED = ("views", "sdf_uniform", "sdf_near")  # what samples are drawn from
+MAPPED = ("views", "normals", "sdf_uniform", "sdf_near")  # what samples are drawn from
 ARRAYS = (*MAPPED, "fingerprint")
 EXCLUDED = "excluded.json"
 
@@ -34,6 +34,7 @@ class Shapes:
     """Training shapes in canonical units (centered, longest edge 0.9), float16."""
 
     views: Float[Array, "shapes views n 3"]  # back-projected depth maps
+    normals: Int8[Array, "shapes views n 3"]  # outward unit normals there, times `NORMAL_STEPS`
     sdf_uniform: Float[Array, "shapes q 4"]  # x y z and signed distance, negative inside
     sdf_near: Float[Array, "shapes q 4"]
 
@@ -106,12 +107,18 @@ def open_shards(folders: str | Path | Sequence[str | Path], split: str) -> Shard
             if chosen:
                 rows += [(len(shards), k) for k in chosen]
                 meta += [found[k] for k in chosen]
-                shards.append({n: np.load(shard / f"{n}.npy", mmap_mode="r") for n in MAPPED})
+                shards.append(mapped(shard))
     if not rows:
         raise ValueError(
             f"{', '.join(map(str, given))}: no {split} shapes; `python -m train.prepare` makes them"
         )
     return ShardView(shards=tuple(shards), rows=tuple(rows), meta=tuple(meta))
+
+
+def mapped(shard: Path) -> dict[str, np.ndarray]:
+    """The arrays of a shard that samples are drawn from; one without normals.npy has none that are known."""
+    found = {n: np.load(shard / f"{n}.npy", mmap_mode="r") for n in MAPPED if (shard / f"{n}.npy").exists()}
+    return {"normals": np.broadcast_to(np.int8(0), found["views"].shape)} | found
 
 
 def read_solids(shard: Path) -> list[SourceMesh]:

@@ -118,7 +118,7 @@ def surfaces(pieces: dict[int, Furniture], rng: np.random.Generator) -> dict[str
     for number, piece in pieces.items():
         low, high = piece.vertices.min(axis=0), piece.vertices.max(axis=0)
         vertices, scale = canonical(piece.vertices)
-        seen = depth_views(vertices, piece.faces, rng).reshape(-1, 3)
+        seen = depth_views(vertices, piece.faces, rng)[0].reshape(-1, 3)
         result[f"piece_{number}"] = (seen * scale + (low + high) / 2).astype(np.float16)
     return result
 

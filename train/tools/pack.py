@@ -37,7 +37,8 @@ def main(
         seed: of the choice.
     """
     rng = np.random.default_rng(seed)
-    sizes = {"views": (views, points), "sdf_uniform": (queries,), "sdf_near": (queries,)}
+    seen, asked = (views, points), (queries,)
+    sizes = {"views": seen, "normals": seen, "sdf_uniform": asked, "sdf_near": asked}
     splits = {
         split: _chosen(shards, split, count, sizes, rng) for split, count in (("train", shapes), ("val", val))
     }
