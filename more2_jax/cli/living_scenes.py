@@ -79,7 +79,7 @@ def _build(
                 scene = start_scene(prior, scan, config, progress=session.watch)
             else:
                 scene = add_scan(prior, scene, scan, config, progress=session.watch)
-            _say_level(session, scene)
+            _say_done(session, scene)
             _store(session, scene, out, config)
             kept += 1
         if scene is None:
@@ -92,12 +92,15 @@ def _build(
         raise KeyboardInterrupt(how) from error
 
 
-def _say_level(session: Session, scene: LivingScene) -> None:
-    """By how much the last scan was leveled, if it was."""
-    from more2_jax.report import leveled_text
+def _say_done(session: Session, scene: LivingScene) -> None:
+    """By how much the last scan was leveled, if it was, and which masks were mended."""
+    from more2_jax.report import leveled_text, repair_text
 
-    if text := leveled_text(scene, scene.scans[-1]):
+    last = scene.scans[-1]
+    if text := leveled_text(scene, last):
         session.say(text)
+    for repair in last.repairs:
+        session.say(repair_text(last, repair))
 
 
 def _stages_of_add(config: SceneConfig) -> int:
@@ -164,7 +167,7 @@ def add(
         keep_compiled_programs()
         prior = _same_prior(scene, prior_name)
         scene = add_scan(prior, scene, scan, config, progress=session.watch)
-        _say_level(session, scene)
+        _say_done(session, scene)
         scene = reconstruct(prior, scene, config, progress=session.watch)
         tell(session, scene)
         _save(session, scene, folder, config)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -67,6 +68,8 @@ class Run:
     masks: tuple[Path, ...] = ()
     """Predicted masks (Mask3D) beside scans without their own: none, or one a scan in the same order."""
     reading: Reading = field(default_factory=Reading)
+    keep_masks: bool = False
+    """Leave masks as they are: parts of one object that another scan saw whole stay objects of their own."""
     config: Path | None = None
     """YAML with values that replace the preset's."""
     resume: bool = False
@@ -75,6 +78,8 @@ class Run:
 
     def __call__(self) -> int:
         config = scene_config(self.preset, self.upright, self.config)
+        if self.keep_masks:
+            config = dataclasses.replace(config, repair_masks=False)
         building.run_scans(
             self.scans,
             self.out,

@@ -8,7 +8,7 @@ from html import escape
 from typing import Any
 
 from more2_jax.progress import STAGES
-from more2_jax.report.wording import STATES
+from more2_jax.report.wording import STATES, repair_text
 from more2_jax.types import LivingScene, ScanRecord
 
 WORDS = {"moved": "moved", "added": "added", "removed": "removed", "static": "stayed", "not_seen": "not seen"}
@@ -74,6 +74,12 @@ def skipped_table(scans: Sequence[ScanRecord]) -> str:
     """What was in the scans but is no object, and why."""
     rows = [[escape(s.name), escape(k.what), escape(k.reason)] for s in scans for k in s.skipped]
     return _table(("scan", "what", "why"), rows) if rows else "<p>Nothing was left out.</p>"
+
+
+def repairs_list(scans: Sequence[ScanRecord]) -> str:
+    """Masks that were mended: which, why, how surely."""
+    items = [f"<li>{escape(repair_text(s, r))}</li>" for s in scans for r in s.repairs]
+    return f"<ul>{''.join(items)}</ul>" if items else "<p>Masks are as they were given.</p>"
 
 
 def timing_table(timing_s: Mapping[str, float]) -> str:

@@ -10,7 +10,14 @@ from pathlib import Path
 from string import Template
 
 from more2_jax.config import SceneConfig
-from more2_jax.report.lists import changes_list, object_list, skipped_table, status_counts, timing_table
+from more2_jax.report.lists import (
+    changes_list,
+    object_list,
+    repairs_list,
+    skipped_table,
+    status_counts,
+    timing_table,
+)
 from more2_jax.report.payload import payload
 from more2_jax.report.wording import leveled_text
 from more2_jax.types import LivingScene
@@ -59,6 +66,7 @@ def report_html(scene: LivingScene, config: SceneConfig) -> str:
         objects=object_list(data["objects"], shown["verdicts"]),
         steps=changes_list(scene, data),
         skipped=skipped_table(scene.scans),
+        repairs=repairs_list(scene.scans),
         timing=timing_table(scene.timing_s),
         scene=_inert(json.dumps(data, separators=(",", ":"), allow_nan=False)),
         blob=blob,

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
 from more2_jax.config import SceneConfig
 from more2_jax.tracking.changes import changes_between, not_seen_in
 from more2_jax.tracking.objects import motion_between, observation_in
-from more2_jax.types import Changes, LivingScene, Observation, ScanRecord, SceneObject
+from more2_jax.types import Changes, LivingScene, Observation, Repair, ScanRecord, SceneObject
 
 LOW_SCORE = 0.3  # a match below it is told as unsure; same objects usually score 0.5 to 0.9
 UNLIKELY = 0.6  # as is a change that is less probable than this
@@ -80,6 +80,21 @@ def leveled_text(scene: LivingScene, scan: ScanRecord) -> str | None:
     """`friday: leveled by 3.2°`; None of a scan that was taken as given, or in a scene that is not upright."""
     tilt_deg = scan.frame.tilt_deg
     return f"{scan.name}: leveled by {tilt_deg:.1f}°" if scene.upright and tilt_deg > 0 else None
+
+
+def repair_text(scan: ScanRecord, repair: Repair) -> str:
+    """`friday: instances 3 and 5 are object_002, in parts (92 % on it)`."""
+    sure = f"in parts ({repair.share:.0%} on it)"
+    if repair.absorbed:
+        return (
+            f"{scan.name}: {_listed(repair.absorbed)} of the scan before and {repair.object} are one, {sure}"
+        )
+    return f"{scan.name}: instances {_listed(map(str, repair.instances))} are {repair.object}, {sure}"
+
+
+def _listed(names: Iterable[str]) -> str:
+    *first, last = names
+    return f"{', '.join(first)} and {last}" if first else last
 
 
 def phrase(v: Verdict) -> str:

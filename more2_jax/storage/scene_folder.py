@@ -22,8 +22,8 @@ import numpy as np
 import yaml
 
 from more2_jax.config import SceneConfig, to_yaml
-from more2_jax.progress import STAGES
 from more2_jax.storage.ply_files import read_mesh, read_points, write_mesh, write_points
+from more2_jax.storage.scene_json import VERSION, mesh_name, points_name, scene_to_json
 from more2_jax.storage.stored_settings import read_settings
 from more2_jax.types import (
     Anchors,
@@ -39,7 +39,6 @@ from more2_jax.types import (
     Skipped,
 )
 
-VERSION = 1
 PAGE = "report.html"
 WRITTEN = (
     "scene.json",
@@ -141,9 +140,9 @@ def _fill(folder: Path, scene: LivingScene, config: SceneConfig, log: str, page:
     text = json.dumps(scene_to_json(scene), indent=1, allow_nan=False)
     (folder / "scene.json").write_text(text + "\n", encoding="utf-8")
     for o in scene.objects:
-        write_points(folder / _points_name(o), o.points, o.point_scan)
+        write_points(folder / points_name(o), o.points, o.point_scan)
         if o.mesh is not None:
-            write_mesh(folder / _mesh_name(o), o.mesh)
+            write_mesh(folder / mesh_name(o), o.mesh)
     _write_background(folder / "background.ply", scene.scans)
     stacked = _stacked([o.embedding for o in scene.objects])
     ids = np.array([o.id for o in scene.objects])
@@ -176,96 +175,6 @@ def _keep_other_files(folder: Path, new: Path) -> None:
             shutil.copytree(path, new / path.name, symlinks=True)
         else:
             shutil.copy2(path, new / path.name, follow_symlinks=False)
-
-
-def _mesh_name(o: SceneObject) -> str:
-    return f"objects/{o.id}.ply"
-
-
-def _points_name(o: SceneObject) -> str:
-    return f"objects/{o.id}_points.ply"
-
-
-def scene_to_json(scene: LivingScene) -> dict[str, Any]:
-    """The content of scene.json: everything but points, meshes and embeddings. Poses are 4×4, row-major."""
-    return {
-        "version": VERSION,
-        "unit": scene.unit,
-        "preset": scene.preset,
-        "prior": scene.prior,
-        "upright": scene.upright,
-        "scans": [
-            {
-                "index": s.index,
-                "name": s.name,
-                "source": s.source,
-                "instances": [int(i) for i in s.instances],
-                "skipped": [{"what": k.what, "reason": k.reason} for k in s.skipped],
-                "not_seen": list(s.not_seen),
-                "repairs": [_repair_to_json(r) for r in s.repairs],
-                "sensors": np.asarray(s.sensors, np.float64).tolist(),
-                "frame": _frame_to_json(s.frame, scene.upright),
-            }
-            for s in scene.scans
-        ],
-        "objects": [_object_to_json(o) for o in scene.objects],
-        "changes": [
-            {
-                "from": c.from_scan,
-                "to": c.to_scan,
-                "moved": list(c.moved),
-                "static": list(c.static),
-                "added": list(c.added),
-                "removed": list(c.removed),
-                "not_seen": list(c.not_seen),
-                "probability": {k: float(p) for k, p in c.probability.items()},
-            }
-            for c in scene.changes
-        ],
-        "timing_s": {k: float(scene.timing_s.get(k, 0.0)) for k in (*STAGES, *scene.timing_s)},
-    }
-
-
-def _repair_to_json(r: Repair) -> dict[str, Any]:
-    lists = {"instances": [int(i) for i in r.instances], "absorbed": list(r.absorbed)}
-    return {"object": r.object, **lists, "share": float(r.share)}
-
-
-def _frame_to_json(frame: Frame, upright: bool) -> dict[str, Any]:
-    """A scan's frame; by how much the scan was leveled, where it was, is for people: `T_scene_scan` holds it."""
-    content = {
-        "T_scene_scan": np.asarray(frame.T_scene_scan, np.float64).tolist(),
-        "sigma_m": float(frame.sigma_m),
-        "sigma_deg": float(frame.sigma_deg),
-    }
-    return content | ({"tilt_deg": frame.tilt_deg} if upright and frame.tilt_deg > 0 else {})
-
-
-def _object_to_json(o: SceneObject) -> dict[str, Any]:
-    return {
-        "id": o.id,
-        "label": o.label,
-        "reference_scan": int(o.reference_scan),
-        "observations": [
-            {
-                "scan": int(seen.scan),
-                "instance": int(seen.instance),
-                "T_ref_scan": np.asarray(seen.T_ref_scan, np.float64).tolist(),
-                "score": float(seen.score),
-                "rms_m": float(seen.rms_m),
-                "converged": bool(seen.converged),
-                "interchangeable": bool(seen.interchangeable),
-                "sigma_m": float(seen.sigma_m),
-                "sigma_deg": float(seen.sigma_deg),
-                "misfit": float(seen.misfit),
-                "accumulated": bool(seen.accumulated),
-            }
-            for seen in o.observations
-        ],
-        "mesh": None if o.mesh is None else _mesh_name(o),
-        "points": _points_name(o),
-        "color": None if o.color is None else {"points": o.color.points, "lab": o.color.lab.tolist()},
-    }
 
 
 # --- reading ------------------------------------------------------------------------------------------------

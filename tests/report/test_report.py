@@ -22,7 +22,7 @@ from more2_jax.report.palette import BASE, ink
 from more2_jax.report.payload import payload
 from more2_jax.report.wording import Verdict, headline, phrase, verdict
 from more2_jax.tracking.objects import points_of
-from more2_jax.types import Changes, Frame
+from more2_jax.types import Changes, Frame, Repair
 
 SCENE, CONFIG = living_scene(), SceneConfig()
 
@@ -371,3 +371,27 @@ def test_apply_pose_of_anchor_is_the_position():
     there = [apply_pose(np.linalg.inv(s.T_ref_scan), anchor)[0] for s in o.observations]
     shift = np.array([s["position"] for s in shown["observations"]]) - there
     assert np.ptp(shift, axis=0).max() < 1e-9
+
+
+def test_what_was_not_seen_is_told_so_and_not_as_removed():
+    changes = [dataclasses.replace(c, removed=(), not_seen=c.removed) for c in SCENE.changes]
+    gone = tuple(o for c in changes for o in c.not_seen)
+    scans = [dataclasses.replace(s, not_seen=gone) for s in SCENE.scans[1:]]
+    scene = dataclasses.replace(SCENE, changes=tuple(changes), scans=(SCENE.scans[0], *scans))
+    page = page_of(scene)
+    assert "not seen: the scan did not look where it stood" in page.buttons["object_002"]
+    assert "1 was not seen" in report_html(scene, CONFIG) and "was removed" not in report_html(scene, CONFIG)
+    told = {motion_text(scene.objects[2], c) for c in changes}
+    assert "not seen" in told and "removed" not in told
+
+
+def test_mended_masks_are_listed():
+    repairs = (
+        Repair(object="object_001", instances=(3, 5, 6), share=0.92),
+        Repair(object="object_000", absorbed=("object_007",), share=0.8),
+    )
+    scans = (*SCENE.scans[:-1], dataclasses.replace(SCENE.scans[-1], repairs=repairs))
+    text = report_html(dataclasses.replace(SCENE, scans=scans), CONFIG)
+    assert "friday: instances 3, 5 and 6 are object_001, in parts (92% on it)" in text
+    assert "object_007 of the scan before and object_000 are one, in parts (80% on it)" in text
+    assert "Masks are as they were given." in report_html(SCENE, CONFIG)

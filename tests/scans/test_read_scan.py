@@ -78,16 +78,6 @@ def test_ply_colors(tmp_path):
     np.testing.assert_array_equal(scan.instances[1].colors, rgb[IDS == 7])
 
 
-def test_ply_normals_go_to_the_instances_and_those_that_are_no_numbers_are_not_known(tmp_path):
-    normals = RNG.normal(size=(500, 3)).astype(np.float32)
-    normals[IDS == 7] = np.nan
-    columns = {c: normals[:, i] for i, c in enumerate(("nx", "ny", "nz"))}
-    scan = read_scan(two_instances(tmp_path / "a.ply", **columns), unit="mm")
-    np.testing.assert_array_equal(scan.instances[0].normals, normals[IDS == 3])
-    assert not scan.instances[1].normals.any()
-    assert read_scan(two_instances(tmp_path / "b.ply")).instances[0].normals is None
-
-
 def test_other_elements_and_list_properties_are_passed_over(tmp_path):
     rows = "\n".join(f"{x} {y} {z} 2 3 0 1 2" for x, y, z in POINTS[:80])
     (tmp_path / "mesh.ply").write_text(
