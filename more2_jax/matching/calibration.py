@@ -57,19 +57,19 @@ UPRIGHT = Calibration(
     intercept=5.6, nearer=-9.5, farther=-2.1, size=0.0, likeness=1.0, lift=-2.5, top=-20.4, raised=2.0
 )
 FREE = Calibration(
-    intercept=7.5,
-    nearer=-17.1,
+    intercept=2.6,
+    nearer=-6.9,
     farther=0.0,
-    size=0.0,
-    likeness=4.7,
-    off_less=-10.7,
-    off_more=-12.6,
+    size=-4.0,
+    likeness=7.25,
+    off_less=-11.1,
+    off_more=-6.5,
     raised=3.0,
 )
 
 
 # Without the prior's say.
-UNASKED = Calibration(intercept=3.4, nearer=-22.9, farther=-4.3, size=-0.1, likeness=7.5, raised=3.0)
+UNASKED = Calibration(intercept=1.2, nearer=-9.9, farther=-3.3, size=-4.2, likeness=5.7, raised=2.0)
 
 
 def calibrated(
