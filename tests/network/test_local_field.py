@@ -29,6 +29,7 @@ from more2_jax.network.prior import encode_one, init_prior, sdf_one
 from more2_jax.types import Anchors
 from train.run.settings import TrainingRun
 
+pytestmark = pytest.mark.quickly
 CHANNELS, BANDWIDTHS, INPUTS = 4, (0.1, 0.3), 6
 encoded, distance = quick_jit(encode_one), quick_jit(sdf_one)
 
