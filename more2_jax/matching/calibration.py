@@ -54,7 +54,7 @@ UNKNOWN = 0.5  # of `off_own`: a prior that lays a cloud so far off its own surf
 
 # Logistic regression on pairs of validation rooms; how, and how well it holds, is in docs/relocalization.md.
 UPRIGHT = Calibration(
-    intercept=5.4, nearer=-9.7, farther=-2.0, size=0.0, likeness=1.0, lift=-2.5, top=-12.7, raised=2.0
+    intercept=4.9, nearer=-9.7, farther=-2.0, size=0.0, likeness=1.0, lift=-2.5, top=-12.7, raised=1.5
 )
 FREE = Calibration(
     intercept=2.6,
