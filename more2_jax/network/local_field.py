@@ -71,7 +71,7 @@ class LocalLookup(nn.Module):
         self.right = self.param("right", kernel_init, shape)
         self.log_bandwidth = self.param("log_bandwidth", lambda _: jnp.log(jnp.array(self.bandwidths)))
         if self.normals:
-            self.log_near_plane = self.param("log_near_plane", lambda _: jnp.log(jnp.array(NEAR_PLANE)))
+            self.log_near_plane = self.param("log_near_plane", lambda _: jnp.log(jnp.full((), NEAR_PLANE)))
 
     def tabulate(self, anchors: Anchors, scale: Float[Array, ""]) -> LocalField:
         """Every anchor's linear function in absolute form: ⟨p − x, B⟩ + b = ⟨p, B⟩ + (b − ⟨x, B⟩)."""

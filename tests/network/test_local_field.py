@@ -12,7 +12,7 @@ import pytest
 from compiling import quick_jit
 from places import ROOT
 
-from more2_jax.config import load_config
+from more2_jax.config import load_config, preset
 from more2_jax.geometry.transform import rescale, transform
 from more2_jax.network.local_field import (
     LEAST_SHARE,
@@ -26,7 +26,8 @@ from more2_jax.network.local_field import (
     plane_rows,
 )
 from more2_jax.network.prior import encode_one, init_prior, sdf_one
-from more2_jax.types import Anchors
+from more2_jax.scene import start_scene
+from more2_jax.types import Anchors, Instance, Scan
 from train.run.settings import TrainingRun
 
 pytestmark = pytest.mark.quickly
@@ -323,3 +324,15 @@ def test_gradients_with_normals_are_finite_where_few_are_known(seeing, cloud):
     gradient = jax.device_get(gradient)
     assert all(np.isfinite(g).all() for g in jax.tree.leaves(gradient))
     assert np.abs(gradient[0]["decoder"]["local_1"]["log_near_plane"]) > 0
+
+
+def test_the_normals_of_a_scans_instances_reach_the_anchors(seeing):
+    """Of points on a sphere the normal is the direction; an instance without normals has none that are known."""
+    unit = unit_rows(np.random.default_rng(6), 300)
+    shells = [Instance(id=1, points=unit + 5.0, normals=unit), Instance(id=2, points=unit - 5.0)]
+    config = dataclasses.replace(preset("paper"), min_points=1)
+    scene = start_scene(seeing, Scan(name="a", source="", instances=tuple(shells)), config)
+    known, unknown = (o.embedding.anchors[0] for o in scene.objects)
+    position = known.offset + scene.objects[0].embedding.scan_center() - 5.0
+    np.testing.assert_allclose(np.asarray(known.normal)[known.mask], position[known.mask], atol=1e-3)
+    assert known.mask.sum() > 10 and not np.asarray(unknown.normal).any()
