@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 
 import numpy as np
@@ -19,7 +19,7 @@ from more2_jax.progress import Watcher, staged
 from more2_jax.refinement.joint_of_objects import embed_accumulated, fit_objects
 from more2_jax.refinement.pose_graph_of_objects import refine_object_poses
 from more2_jax.tracking.changes import changes_between, forgotten, not_seen_in
-from more2_jax.tracking.identify import Found, identify
+from more2_jax.tracking.identify import Identified, identify
 from more2_jax.tracking.leveling import as_given, level_of, leveled
 from more2_jax.tracking.looked_at import not_looked_at
 from more2_jax.tracking.object_views import few_sensors, instance_sights, object_sights
@@ -31,13 +31,12 @@ from more2_jax.tracking.objects import (
 )
 from more2_jax.tracking.relocalize import known_object, relocalize
 from more2_jax.tracking.scan_frame import Rooms
-from more2_jax.tracking.split_masks import Mended, mend_splits
+from more2_jax.tracking.split_masks import mend_splits
 from more2_jax.types import (
     Embedding,
     Frame,
     Instance,
     LivingScene,
-    Observation,
     ObservedObject,
     Repair,
     Scan,
@@ -90,59 +89,46 @@ def add_scan(
         embeddings = embed(prior, [i.points for i in instances], [i.normals for i in instances])
     with stage("match", len(instances)):
         old, new = compared_objects(scene, instances, embeddings, level, config)
-        known = [o for o, _ in old]
-        identified = identify(prior, known, new, config, rooms_of(scene, level))
-    found, gone = identified.found, {objects[k].id: p for k, p in identified.gone.items()}
+        identified = identify(prior, [o for o, _ in old], new, config, rooms_of(scene, level))
+    found = identified.found
     with stage("register", len(found)):
         seen, frame = relocalize(prior, objects, old, instances, new, identified, index, config)
-    mended = mended_masks(objects, instances, found, seen, config)
-    objects, came_back = with_observations(mended, found, seen, config)
+    pairs = [(f.object, f.instance) for f in found if config.repair_masks]
+    mended = mend_splits(objects, instances, pairs, seen[: len(pairs)])
+    objects = mended.objects
+    for f, observation in zip(found, seen, strict=True):
+        objects[f.object] = seen_again(objects[f.object], mended.instances[f.instance], observation)
     if config.accumulate_target:
         with stage("encode", len(found)):
             changed = [f.object for f, s in zip(found, seen, strict=True) if s.accumulated]
             objects = embed_accumulated(prior, objects, changed)
-    missing = sorted(set(range(len(objects))) - {f.object for f in found} - mended.object_parts)
+    missing, left = mended.left_over([(f.object, f.instance) for f in found])
     unseen = not_looked_at(objects, missing, level, frame.T_scene_scan, config.upright)
-    left = sorted(set(range(len(instances))) - {f.instance for f in found} - mended.instance_parts)
     first = next_number(objects)
-    fresh = [new_object(first + n, index, instances[i], embeddings[i], frame) for n, i in enumerate(left)]
-    come = {o.id: identified.new[i] for o, i in zip(fresh, left, strict=True) if i in identified.new}
-    objects, frame = as_given([*mended.whole(objects), *fresh], index, frame, T_level_scan)
+    fresh = {i: new_object(first + n, index, instances[i], embeddings[i], frame) for n, i in enumerate(left)}
+    chance = chances(identified, objects, fresh, config)
+    objects, frame = as_given([*mended.whole(objects), *fresh.values()], index, frame, T_level_scan)
     scene = forgotten(scene, mended.absorbed)
     scans = (*scene.scans, record(index, scan, instances, skipped, frame, unseen, mended.repairs))
-    chance = gone | came_back | come
     changes = changes_between(objects, index - 1, index, config, chance, not_seen_in(scans))
-    return dataclasses.replace(
-        scene,
-        scans=scans,
-        objects=tuple(objects),
-        changes=(*scene.changes, changes),
-        timing_s=timing,
-    )
+    changed = {"scans": scans, "objects": tuple(objects), "changes": (*scene.changes, changes)}
+    return dataclasses.replace(scene, **changed, timing_s=timing)
 
 
-def mended_masks(
+def chances(
+    identified: Identified,
     objects: Sequence[SceneObject],
-    instances: Sequence[Instance],
-    found: Sequence[Found],
-    seen: Sequence[Observation],
+    fresh: Mapping[int, SceneObject],
     config: SceneConfig,
-) -> Mended:
-    """Instances and objects with their masks repaired, if that is asked for."""
-    if not config.repair_masks:
-        return Mended(instances=list(instances), objects=list(objects))
-    return mend_splits(objects, instances, [(f.object, f.instance) for f in found], seen)
+) -> dict[str, float]:
+    """By id, how likely it is that what is gone is gone, that what came back is what it was, that what is new is new.
 
-
-def with_observations(
-    mended: Mended, found: Sequence[Found], seen: Sequence[Observation], config: SceneConfig
-) -> tuple[list[SceneObject], dict[str, float]]:
-    """The objects with what the scan saw of them, and (`EvidenceMatcher`) how likely it is that it was they."""
-    objects = list(mended.objects)
-    for f, observation in zip(found, seen, strict=True):
-        objects[f.object] = seen_again(objects[f.object], mended.instances[f.instance], observation)
+    `fresh`: new objects by the rows of their instances.
+    """
+    gone = {objects[k].id: p for k, p in identified.gone.items()}
     known = isinstance(config.matching, EvidenceMatcher)
-    return objects, {objects[f.object].id: f.score for f in found if known}
+    back = {objects[f.object].id: f.score for f in identified.found if known}
+    return gone | back | {fresh[i].id: p for i, p in identified.new.items() if i in fresh}
 
 
 def reconstruct(

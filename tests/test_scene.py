@@ -15,7 +15,8 @@ from more2_jax.meshing import object_mesh
 from more2_jax.meshing.object_mesh import object_floor
 from more2_jax.registration import search, surface
 from more2_jax.scene import add_scan, reconstruct, start_scene
-from more2_jax.tracking.objects import moved_probability, points_of
+from more2_jax.tracking.changes import moved_probability
+from more2_jax.tracking.objects import points_of
 from more2_jax.types import Instance, Mesh, Scan
 
 VISITS = (

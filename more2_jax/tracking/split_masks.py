@@ -44,6 +44,12 @@ class Mended:
         """Ids of the objects that are parts of others."""
         return frozenset(id_ for r in self.repairs for id_ in r.absorbed)
 
+    def left_over(self, found: Sequence[tuple[int, int]]) -> tuple[list[int], list[int]]:
+        """Rows of the objects and of the instances that were neither found nor are parts of others."""
+        objects, instances = ({pair[side] for pair in found} for side in (0, 1))
+        missing = set(range(len(self.objects))) - objects - self.object_parts
+        return sorted(missing), sorted(set(range(len(self.instances))) - instances - self.instance_parts)
+
     def whole(self, objects: Sequence[SceneObject]) -> list[SceneObject]:
         """The objects less those that are parts of others."""
         return [o for row, o in enumerate(objects) if row not in self.object_parts]
