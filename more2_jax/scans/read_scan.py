@@ -43,12 +43,11 @@ def read_scan(
     `objectId`, `object_id` or `label`, in this order; `instance_property` names another), an NPZ with `points` (n,
     3), `instance` (n,) and optional `label` (n,), `color` or `colors` (n, 3), `normal` or `normals` (n, 3),
     `sensors` (s, 3), a folder of one PLY per object, or another of `data.formats.registry`. `<scan>.sensors.txt`
-    beside it may say where its sensors stood, x y z a line. Instance ids ≤ 0 are background. `unit` is the file's:
-    m, cm or mm. Instances of fewer than `min_points` points are reported in `Scan.skipped`; sizes that look like
-    another unit, in `Scan.warnings`. `masks` are predicted ones (`data.masks`): those scored `min_score` or more
-    replace the scan's own. `segment="geometric"` cuts a cloud without instances into planes and clusters;
-    `depth_frames` reads the raw depth of 3RScan, not its mesh (paper §4); normals are the file's, else those of
-    its faces.
+    beside it may hold the places of its sensors. Instance ids ≤ 0 are background. `unit` is the file's: m, cm or
+    mm. Instances of fewer than `min_points` points are reported in `Scan.skipped`; sizes that look like another
+    unit, in `Scan.warnings`. `masks` are predicted ones (`data.masks`): those scored `min_score` or more replace
+    the scan's own. `segment="geometric"` cuts a cloud without instances into planes and clusters; `depth_frames`
+    reads the raw depth of 3RScan (paper §4). Normals are the file's, else those of its faces.
 
     Raises ValueError, in one line, when the file is missing, unknown, damaged, has no instance property, has
     coordinates that are not finite, or no instance is left.
