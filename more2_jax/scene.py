@@ -104,7 +104,7 @@ def add_scan(
             objects = embed_accumulated(prior, objects, changed)
     missing, left = mended.left_over([(f.object, f.instance) for f in found])
     unseen = not_looked_at(objects, missing, level, frame.T_scene_scan, config.upright)
-    first = next_number(objects)
+    first = next_number(objects, scene.scans)
     fresh = {i: new_object(first + n, index, instances[i], embeddings[i], frame) for n, i in enumerate(left)}
     chance = chances(identified, objects, fresh, config)
     objects, frame = as_given([*mended.whole(objects), *fresh.values()], index, frame, T_level_scan)

@@ -102,6 +102,32 @@ def test_identical_copies_are_matched_one_to_one_and_flagged(tiny_prior):
     assert made.changes[0].static == tuple(o.id for o in made.objects)
 
 
+def in_parts(s: Scan) -> Scan:
+    """The scan whose first instance falls into two, of which the smaller has the id 99."""
+    first, *others = s.instances
+    cut = first.points[:, 0] < np.quantile(first.points[:, 0], 0.7)
+    parts = [dataclasses.replace(first, points=first.points[rows]) for rows in (cut, ~cut)]
+    return dataclasses.replace(s, instances=(parts[0], *others, dataclasses.replace(parts[1], id=99)))
+
+
+@pytest.mark.parametrize("split_scan", [0, 1])
+def test_a_mask_in_parts_is_one_object_where_another_scan_shows_it_whole(tiny_prior, split_scan):
+    visits = [scan(n, {0: (0.0, 0.0), 1: (0.3, 3.0)}) for n in "ab"]
+    visits[split_scan] = in_parts(visits[split_scan])
+    made, kept = (
+        add_scan(tiny_prior, start_scene(tiny_prior, visits[0], c), visits[1], c)
+        for c in (CONFIG, dataclasses.replace(CONFIG, repair_masks=False))
+    )
+    assert [sorted(s.scan for s in o.observations) for o in made.objects] == [[0, 1]] * 2
+    assert not made.changes[0].added and not made.changes[0].removed
+    (repair,) = made.scans[1].repairs
+    assert repair.object == "object_000" and repair.share > 0.9
+    assert len(made.objects[0].points) == 2 * len(piece(0))
+    assert (repair.instances, repair.absorbed) == (((), ("object_002",)), ((10, 99), ()))[split_scan]
+    assert len(kept.objects) == 3 and not kept.scans[1].repairs
+    assert len(kept.changes[0].added) + len(kept.changes[0].removed) == 1
+
+
 def test_every_pose_maps_its_observation_onto_the_reference(scene):
     for o in scene.objects:
         kind = int(o.label[-1])

@@ -9,7 +9,7 @@ import numpy as np
 
 from more2_jax.geometry.poses import Points, Pose, apply_pose, rotation_error_deg
 from more2_jax.matching.color import color_of, pooled
-from more2_jax.types import Embedding, Frame, Instance, Observation, SceneObject
+from more2_jax.types import Embedding, Frame, Instance, Observation, ScanRecord, SceneObject
 
 SCENE_FRAME = Frame()  # that of the first scan
 
@@ -39,9 +39,10 @@ def new_object(
     )
 
 
-def next_number(objects: Sequence[SceneObject]) -> int:
-    """One that no object has: ids of objects that were parts of others are gone."""
-    return 1 + max((int(o.id.rpartition("_")[2]) for o in objects), default=-1)
+def next_number(objects: Sequence[SceneObject], scans: Sequence[ScanRecord]) -> int:
+    """One that no object has or had: ids of objects that were parts of others are not given again."""
+    ids = [o.id for o in objects] + [id_ for s in scans for r in s.repairs for id_ in r.absorbed]
+    return 1 + max((int(id_.rpartition("_")[2]) for id_ in ids), default=-1)
 
 
 def seen_again(o: SceneObject, instance: Instance, seen: Observation) -> SceneObject:

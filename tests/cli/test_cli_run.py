@@ -62,6 +62,15 @@ def test_demo_runs_on_the_bundled_scans_and_ends_with_the_truth(tmp_path, capsys
     assert capsys.readouterr().out.splitlines()[-1] == "5 right"
 
 
+@pytest.mark.parametrize(("option", "repaired"), [([], True), (["--keep-masks"], False)])
+def test_keep_masks_turns_their_repair_off(tmp_path, monkeypatch, option, repaired):
+    asked = []
+    monkeypatch.setattr(building, "run_scans", lambda *args, **_: asked.append(args))
+    assert main(["run", "a.ply", "b.ply", "--out", str(tmp_path / "room"), *option]) == 0
+    config = asked[0][2]
+    assert config == dataclasses.replace(preset("robust"), repair_masks=repaired)
+
+
 def test_one_scan_is_reconstructed_without_changes(tmp_path, tiny, capsys):
     a = scan_file(tmp_path / "a.ply")
     assert run_quickly(a, out=tmp_path / "room", prior=tiny) == 0

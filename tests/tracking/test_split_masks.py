@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from more2_jax.geometry.poses import apply_pose
 from more2_jax.tracking.objects import new_object, next_number, points_of
 from more2_jax.tracking.split_masks import joined, mend_splits, share_on
-from more2_jax.types import Color, Embedding, Instance, Observation
+from more2_jax.types import Color, Embedding, Instance, Observation, Repair, ScanRecord
 
 RNG = np.random.default_rng(0)
 CODE = Embedding(
@@ -99,7 +99,11 @@ def test_parts_known_before_are_one_when_the_whole_is_seen():
     np.testing.assert_allclose(
         np.sort(points_of(together, together.observations[0]), axis=0), np.sort(WHOLE, axis=0), atol=1e-12
     )
-    assert next_number(mended.whole(mended.objects)) == 3
+    left = mended.whole(mended.objects)
+    assert next_number(left, ()) == 3
+    gone = Repair(object="object_000", absorbed=("object_008",))
+    scan = ScanRecord(index=1, name="", source="", instances=(), repairs=(gone,))
+    assert next_number(left, [scan]) == 9  # no id is given twice
 
 
 def halves(points):
