@@ -8,19 +8,13 @@ os.environ["JAX_PLATFORMS"] = "cpu"
 import jax
 import jaxtyping
 import pytest
+from checked_modules import checked_modules
 from compiling import quickly
 from jaxtyping import install_import_hook
 from places import ROOT
 
-# Before anything of more2_jax is imported: every call's shapes and dtypes are held against its annotations. Not in
-# `types`, whose records pass through JAX's transformations, nor where values of any kind are taken and refused.
-CHECKED = (
-    "geometry.padding matching.color network.decoder geometry.se3_descent network.encoder network.embedding_batch "
-    "geometry.points refinement.joint matching.code_assignment meshing.extract metrics tracking.objects network.prior "
-    "registration.register registration.starting_poses tracking.identify network.vector_neurons matching.assignment "
-    "matching.calibration matching.color network.neighbor_scan geometry.floor geometry.outliers"
-)
-install_import_hook([f"more2_jax.{name}" for name in CHECKED.split()], "beartype.beartype")
+# Before anything of more2_jax is imported: every call's shapes and dtypes are held against its annotations.
+install_import_hook(checked_modules(), "beartype.beartype")
 jax.config.update("jax_default_matmul_precision", "highest")
 
 # One browser for all tests of the page; after the hook, for it imports more2_jax.
