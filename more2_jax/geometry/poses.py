@@ -31,10 +31,13 @@ def vertical_shift(height_m: float) -> Pose:
 
 def world_poses(
     local: jaxlie.SE3,
-    target_origin: Float[np.ndarray, "*batch 3"],
-    source_origin: Float[np.ndarray, "*batch 3"],
-) -> Float[np.ndarray, "*batch 4 4"]:
-    """Poses between the scans' own frames, from those between local frames about the given origins."""
+    target_origin: Float[np.ndarray, "*#batch 3"],
+    source_origin: Float[np.ndarray, "*#batch 3"],
+) -> Float[np.ndarray, "*poses 4 4"]:
+    """Poses between the scans' own frames, from those between local frames about the given origins.
+
+    Origins may be shared by several poses: they broadcast.
+    """
     T = np.zeros((*local.wxyz_xyz.shape[:-1], 4, 4))
     quaternion = np.asarray(local.rotation().wxyz, np.float64)
     R = Rotation.from_quat(quaternion.reshape(-1, 4), scalar_first=True).as_matrix()

@@ -6,7 +6,7 @@ import itertools
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Real
 from scipy.ndimage import binary_dilation, maximum_filter
 
 Grid = Float[np.ndarray, "i j k"]
@@ -22,8 +22,8 @@ class Lattice:
     step: float  # edge of a cell
     shape: tuple[int, ...]  # corners along each axis
 
-    def at(self, index: Int[np.ndarray, "*p 3"]) -> Float[np.ndarray, "*p 3"]:
-        """Where corners lie."""
+    def at(self, index: Real[np.ndarray, "*p 3"]) -> Float[np.ndarray, "*p 3"]:
+        """Where corners lie, and what lies between them by fractions."""
         return self.low + self.step * index
 
     def corners(self) -> Points:
@@ -73,7 +73,7 @@ def cube(cells: int, half: float) -> Lattice:
     return Lattice(np.full(3, -half), 2 * half / cells, (cells + 1,) * 3)
 
 
-def upsampled(x: Grid) -> Grid:
+def upsampled(x: Grid) -> Float[np.ndarray, "2*i-1 2*j-1 2*k-1"]:
     """Linear interpolation to half the step: `scipy.ndimage.zoom`, which takes eight times as long."""
     for axis in (2, 1, 0):
         shape = list(x.shape)

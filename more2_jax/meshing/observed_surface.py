@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, Real
 from scipy.spatial import KDTree
 
 from more2_jax.geometry.poses import Points
@@ -102,9 +102,9 @@ class ObservedSurface:
         return screened_poisson(field, lattice, self.points, self.normal, self.area, length, margin)
 
 
-def uniform_subsample(points: Float[np.ndarray, "n *_"], most: int = MAX_POINTS) -> Float[np.ndarray, "m *_"]:
+def uniform_subsample(rows: Real[np.ndarray, "n *_"], most: int = MAX_POINTS) -> Real[np.ndarray, "m *_"]:
     """At most `most` of the rows, at even steps from the first to the last."""
-    return points[np.linspace(0, len(points) - 1, min(len(points), most)).astype(int)]
+    return rows[np.linspace(0, len(rows) - 1, min(len(rows), most)).astype(int)]
 
 
 def fit_observed_surface(

@@ -76,7 +76,7 @@ def gaussian(wavenumbers: Sequence[np.ndarray], width: float) -> np.ndarray:
     return x * y * z
 
 
-def splat(points: Points, values: Float[np.ndarray, "p k"], lattice: Lattice) -> list[Grid]:
+def splat(points: Points, values: Float[np.ndarray, "p c"], lattice: Lattice) -> list[Grid]:
     """Densities of `values` at points, shared by the eight corners of their cells; none of points outside."""
     place = (points - lattice.low) / lattice.step
     at = np.floor(place).astype(int)[:, None] + CELL_CORNERS

@@ -125,9 +125,9 @@ def about(code: Embedding, origin: Float[Array | np.ndarray, "*b 3"] | None) -> 
 def take_pairs(pairs: PairBatch, rows: Sequence[int]) -> PairBatch:
     """The pairs in `rows`, in that order."""
     at = np.asarray(rows, int)
-    rest = dataclasses.replace(pairs.local(), source=None, target=None)
+    rest = {"stayed": pairs.stayed, "candidates": pairs.candidates, "prepared": pairs.prepared}
     chosen = jax.tree.map(lambda x: x[at], rest)
-    return dataclasses.replace(chosen, source=pairs.source.take(at), target=pairs.target.take(at))
+    return PairBatch(source=pairs.source.take(at), target=pairs.target.take(at), **chosen)
 
 
 def paired_rows(

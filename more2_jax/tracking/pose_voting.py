@@ -55,7 +55,9 @@ def turns_deg(R: Float[np.ndarray, "*b 3 3"], other: Float[np.ndarray, "3 3"]) -
     return np.rad2deg(np.arccos(np.clip(cosine, -1, 1)))
 
 
-def nearest_way(T: Pose, votes: Votes) -> tuple[Float[np.ndarray, " p"], Pose, Bool[np.ndarray, " p"]]:
+def nearest_way(
+    T: Pose, votes: Votes
+) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, "p 4 4"], Bool[np.ndarray, " p"]]:
     """Of every pair, how far a frame is off (meters, at the mean), the nearest of its ways, and whether turns agree."""
     there = np.einsum("phij,pj->phi", votes.T_scene_scan[..., :3, :3], votes.center)
     there += votes.T_scene_scan[..., :3, 3]

@@ -95,7 +95,7 @@ def test_log_odds_are_linear_and_the_two_ways_have_no_order():
 def test_the_prior_is_asked_in_any_orientation_alone_and_only_where_it_knows_the_clouds():
     rng = np.random.default_rng(0)
     evidence = PairEvidence(
-        pose=np.zeros(1, int),
+        pose=np.zeros(3, int),
         radius_m=np.full(3, 0.5),
         off_own=np.array([0.0, UNKNOWN, UNKNOWN + 0.1]),
         **{k: rng.uniform(size=3) for k in FIELDS},

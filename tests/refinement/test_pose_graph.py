@@ -169,6 +169,6 @@ def test_as_many_programs_as_numbers_of_observations():
         for count in (2, 4):
             views = [box_view(rng, f) for f in AROUND[:count]]
             optimize_pose_graphs(
-                observed(views, slips(np.random.default_rng(seed), count, upright=True)), STEPS, True
+                observed(views, slips(np.random.default_rng(seed), count, upright=True)), STEPS, "upright"
             )
     assert optimize_pose_graphs._cache_size() == 2
