@@ -85,7 +85,7 @@ def splat(points: Points, values: Float[np.ndarray, "p c"], lattice: Lattice) ->
     flat = np.ravel_multi_index(tuple(at[held].T), lattice.shape)
     share = [(weight * v[:, None])[held] for v in values.T]
     count = int(np.prod(lattice.shape))
-    return [np.bincount(flat, s, minlength=count).reshape(lattice.shape) for s in share]
+    return [np.bincount(flat, s, minlength=count).astype(float).reshape(lattice.shape) for s in share]
 
 
 def surface_areas(

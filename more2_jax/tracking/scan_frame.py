@@ -49,7 +49,7 @@ def common_frame(
     lifted = vertical_shift(weighed.height_m)
     pairs = np.argwhere(weighed.odds > 0)
     votes = Votes(
-        T_scene_scan=weighed.aligned.T_old_new[[weighed.aligned.row_of(k, i) for k, i in pairs]],
+        T_scene_scan=weighed.aligned.T_old_new[[weighed.aligned.row_of(k, i) for k, i in pairs.tolist()]],
         center=np.stack([o.points.mean(axis=0) for o in new])[pairs[:, 1]],
         object=pairs[:, 0],
         instance=pairs[:, 1],

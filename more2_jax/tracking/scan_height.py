@@ -118,7 +118,7 @@ def settled_height(aligned: AlignedPairs, matcher: EvidenceMatcher, height_m: fl
     pairs = assign(first.odds, np.zeros(first.odds.shape), 0.0)
     if len(pairs) < 2:
         return first
-    rows = [aligned.row_of(k, i) for k, i in pairs]
+    rows = [aligned.row_of(k, i) for k, i in pairs.tolist()]
     best = evidence_at(aligned, matcher.search, "upright", height_m).pose[rows]
     corrected_m = float(np.median(aligned.T_old_new[rows, best, 2, 3]))
     if not LEAST_M < abs(corrected_m - height_m) < OUT_OF_REACH_M:

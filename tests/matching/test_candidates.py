@@ -210,7 +210,7 @@ def test_pairs_are_listed_row_by_row_and_taken_with_the_poses_found(tiny_prior, 
     old, new = lifted_room
     matcher = EvidenceMatcher(candidates=1)
     aligned = align_candidates(tiny_prior, old, new, matcher, "upright")
-    listed = [tuple(pair) for pair in np.argwhere(aligned.among)]
+    listed = [tuple(pair) for pair in np.argwhere(aligned.among).tolist()]
     assert [aligned.row_of(k, i) for k, i in listed] == list(range(len(listed)))
     chosen = listed[::-1]
     taken = aligned.take(chosen)
