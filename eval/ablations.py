@@ -22,15 +22,16 @@ from eval.harness.results import finish
 from eval.harness.runs import run_scenes, start_run
 from eval.matching import RECALL, match_own
 from eval.matching import record as match_record
-from eval.reconstruction import Seen, embedded, fitted_in_batches, mesh_seen, seen_objects, with_joint
+from eval.reconstruction import Seen, embedded, fitted_in_batches, seen_objects, with_joint
 from eval.registration import own_records, own_settings, true_pairs
 from eval.scores.figures import Figure, Record, in_columns
 from eval.scores.mesh_scores import RECONSTRUCTED, mesh_scores
 from eval.scores.pose_scores import pose_scores
 from more2_jax.config import CodeMatcher, JointConfig, SceneConfig
+from more2_jax.geometry.observations import with_poses
+from more2_jax.meshing.object_mesh import object_mesh
 from more2_jax.network.prior import Prior
-from more2_jax.refinement.joint_of_objects import with_poses
-from more2_jax.types import ObservedObject, SceneObject
+from more2_jax.types import AccumulatedObject, ObservedObject
 from train.run.program import run
 
 RATES = {
@@ -153,8 +154,8 @@ def only(config: JointConfig, freed: Sequence[str]) -> JointConfig:
 
 
 def registered(
-    prior: Prior, seen: Sequence[Seen], objects: Sequence[SceneObject], config: SceneConfig, batch: int
-) -> list[SceneObject]:
+    prior: Prior, seen: Sequence[Seen], objects: Sequence[AccumulatedObject], config: SceneConfig, batch: int
+) -> list[AccumulatedObject]:
     """The objects with the method's own poses in place of the true ones, encoded anew."""
     raw = [[s.scene.instance(o.scan, o.instance).points for o in s.observations] for s in seen]
     codes = embed_all(prior, [c for clouds in raw for c in clouds], batch)
@@ -180,7 +181,7 @@ def registered(
 
 def joint_records(
     seen: Sequence[Seen],
-    objects: Sequence[SceneObject],
+    objects: Sequence[AccumulatedObject],
     prior: Prior,
     config: SceneConfig,
     method: str,
@@ -189,12 +190,12 @@ def joint_records(
     """One record of each object's mesh, and one of each of its poses."""
     found = []
     for s, own in zip(seen, objects, strict=True):
-        scores = mesh_scores(mesh_seen(prior, s, own, config), s.known, s.known.T_scan_model[0], samples)
+        scores = mesh_scores(object_mesh(prior, own, config), s.known, s.known.T_scan_model[0], samples)
         found.append((s.scene.name, {"method": method, "object": s.known.name, **scores}))
         target = s.scene.instance(0, s.known.instance[0]).points
-        for o in own.observations[1:]:
+        for o, T_ref_scan in zip(s.observations[1:], own.poses[1:], strict=True):
             source = s.scene.instance(o.scan, o.instance).points
-            pose = pose_scores(o.T_ref_scan, s.known, s.known, o.scan, 0, source, target)
+            pose = pose_scores(T_ref_scan, s.known, s.known, o.scan, 0, source, target)
             found.append((s.scene.name, {"method": method, "to_scan": o.scan, **pose}))
     return found
 

@@ -32,8 +32,9 @@ from more2_jax.geometry.poses import apply_pose
 from more2_jax.meshing.object_mesh import object_mesh
 from more2_jax.network.prior import Prior
 from more2_jax.refinement.joint_of_objects import fit_objects
-from more2_jax.scene import record
-from more2_jax.types import Mesh, Observation, SceneObject
+from more2_jax.scene import remembered
+from more2_jax.tracking.object_views import few_sensors
+from more2_jax.types import AccumulatedObject, Mesh, Observation
 from train.run.program import run
 
 
@@ -153,7 +154,7 @@ def work(
     records = []
     for name, (objects, spent_s) in zip(names, both if config.joint.steps else both[::-1], strict=True):
         records += [
-            scored(s, name, lambda s=s, own=own: mesh_seen(prior, s, own, config), spent_s, o.samples)
+            scored(s, name, lambda own=own: object_mesh(prior, own, config), spent_s, o.samples)
             for s, own in zip(seen, objects, strict=True)
         ]
     for name, surface in peers.items():
@@ -161,44 +162,37 @@ def work(
     return [[r for n, r in records if n == scene.name] for scene in scenes]
 
 
-def timed(stage: Callable[[], list[SceneObject]], count: int) -> tuple[list[SceneObject], float]:
+def timed(stage: Callable[[], list[AccumulatedObject]], count: int) -> tuple[list[AccumulatedObject], float]:
     """What a stage returns, and the seconds it took for each of `count`."""
     began = time.perf_counter()
     result = stage()
     return result, (time.perf_counter() - began) / max(1, count)
 
 
-def embedded(prior: Prior, seen: Sequence[Seen], batch: int) -> list[SceneObject]:
-    """The objects as a living scene has them."""
+def embedded(prior: Prior, seen: Sequence[Seen], batch: int) -> list[AccumulatedObject]:
+    """The objects in the rooms that their scans show, as refinement and meshing take them."""
     codes = embed_all(prior, [s.points for s in seen], batch)
     return [
-        SceneObject(
-            id=f"object_{n:03d}",
-            label=s.known.category,
-            reference_scan=0,
-            observations=s.observations,
+        AccumulatedObject(
             points=s.points,
-            point_scan=s.point_scan,
+            observation=np.searchsorted([seen.scan for seen in s.observations], s.point_scan),
+            poses=np.stack([seen.T_ref_scan for seen in s.observations]),
             embedding=code,
+            sensors=tuple(few_sensors(s.scene.scans[seen.scan]) for seen in s.observations),
+            background=remembered(s.scene.scans[0].background),
         )
-        for n, (s, code) in enumerate(zip(seen, codes, strict=True))
+        for s, code in zip(seen, codes, strict=True)
     ]
 
 
-def mesh_seen(prior: Prior, s: Seen, o: SceneObject, config: SceneConfig) -> Mesh | None:
-    """The mesh of an object in the room that its scans show."""
-    scans = [record(k, scan, list(scan.instances), ()) for k, scan in enumerate(s.scene.scans)]
-    return object_mesh(prior, o, scans, config)
-
-
 def fitted_in_batches(
-    prior: Prior, objects: Sequence[SceneObject], config: SceneConfig, batch: int
-) -> list[SceneObject]:
+    prior: Prior, objects: Sequence[AccumulatedObject], config: SceneConfig, batch: int
+) -> list[AccumulatedObject]:
     """Joint optimization of every object, `batch` a call."""
-    found: list[SceneObject] = []
+    found: list[AccumulatedObject] = []
     for start in range(0, len(objects), batch):
         part = objects[start : start + batch]
-        found += fit_objects(prior, part, range(len(part)), config)
+        found += fit_objects(prior, part, config)
     return found
 
 

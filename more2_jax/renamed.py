@@ -139,7 +139,9 @@ NAMES = {
         "UNKNOWN UPRIGHT calibrated features log_odds weighed",
     },
     "fitting": {
+        "more2_jax.geometry.observations": "with_poses",
         "more2_jax.geometry.poses": "local_pose",
+        "more2_jax.tracking.accumulated": "embed_accumulated",
     },
     "frames": {
         "more2_jax.geometry.floor": "LAYER_M floor_height",
@@ -154,6 +156,9 @@ NAMES = {
     "registration": {
         "more2_jax.registration.older_calls": "world_pose",
         "more2_jax.registration.descent": "STILL refine registration_loss",
+    },
+    "sights": {
+        "more2_jax.geometry.observations": "seen_from",
     },
     "sight": {
         "more2_jax.geometry.transform": "moved_sight scale_sight",

@@ -12,12 +12,13 @@ from jaxtyping import Float
 from more2_jax.config import EvidenceMatcher, SceneConfig
 from more2_jax.geometry.poses import Pose, apply_pose
 from more2_jax.matching.color import color_of
-from more2_jax.meshing.object_mesh import in_several_scans, object_floor, object_meshes
+from more2_jax.meshing.object_mesh import object_meshes
 from more2_jax.network.embedding_batch import embed
 from more2_jax.network.prior import Prior
 from more2_jax.progress import Watcher, staged
-from more2_jax.refinement.joint_of_objects import embed_accumulated, fit_objects
+from more2_jax.refinement.joint_of_objects import fit_objects
 from more2_jax.refinement.pose_graph_of_objects import refine_object_poses
+from more2_jax.tracking.accumulated import accumulated_objects, embed_accumulated, with_refined
 from more2_jax.tracking.changes import changes_between, forgotten, not_seen_in
 from more2_jax.tracking.identify import Identified, identify
 from more2_jax.tracking.leveling import as_given, level_of, leveled
@@ -25,6 +26,7 @@ from more2_jax.tracking.looked_at import not_looked_at
 from more2_jax.tracking.object_views import few_sensors, instance_sights, object_sights
 from more2_jax.tracking.objects import (
     SCENE_FRAME,
+    accumulated,
     new_object,
     next_number,
     seen_again,
@@ -143,15 +145,16 @@ def reconstruct(
     """
     timing, objects = dict(scene.timing_s), list(scene.objects)
     todo = [k for k, o in enumerate(objects) if o.mesh is None]
-    again = [k for k in todo if in_several_scans(objects[k])]
+    again = [k for k in todo if len(accumulated(objects[k])) > 1]
     align, fit = again if config.pose_graph.steps else [], again if config.joint.steps else []
     with staged(timing, progress, "close", len(align)):
-        floors = {k: object_floor(objects[k], scene.scans, config) for k in align}
-        objects = refine_object_poses(prior, objects, align, scene.scans, floors, config)
+        several = list(accumulated_objects(objects, align, scene.scans))
+        objects = with_refined(objects, align, refine_object_poses(prior, several, config))
     with staged(timing, progress, "joint", len(fit)):
-        objects = fit_objects(prior, objects, fit, config)
+        several = list(accumulated_objects(objects, fit, scene.scans))
+        objects = with_refined(objects, fit, fit_objects(prior, several, config))
     with staged(timing, progress, "mesh", len(todo)) as advance:
-        meshes = object_meshes(prior, [objects[k] for k in todo], scene.scans, config)
+        meshes = object_meshes(prior, accumulated_objects(objects, todo, scene.scans), config)
         for done, (k, mesh) in enumerate(zip(todo, meshes, strict=True), start=1):
             objects[k] = dataclasses.replace(objects[k], mesh=mesh)
             advance(done)

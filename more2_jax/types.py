@@ -243,6 +243,24 @@ class ObservedObject:
 
 
 @dataclass(frozen=True, kw_only=True)
+class AccumulatedObject:
+    """An object with the k observations that make up its shape, as refinement and meshing take it; meters, float64.
+
+    Points lie in the object's frame. What observation j saw alone is `inverse(poses[j]) @ points[observation == j]`,
+    in the frame of its scan (`geometry.observations`).
+    """
+
+    points: Float[np.ndarray, "n 3"]
+    observation: Integer[np.ndarray, " n"]  # that each point is of, 0 to k − 1
+    poses: Float[np.ndarray, "k 4 4"]  # T_ref_scan; the first observation is held where others are moved
+    embedding: Embedding  # NumPy leaves, unbatched; of all points together
+    # Of each observation, where its scan's sensors stood, in that scan's frame; (0, 3) where not known.
+    sensors: tuple[Float[np.ndarray, "_ 3"], ...]
+    # What was no object in the scan that saw it first, in the object's frame: its floor is that of this room.
+    background: Float[np.ndarray, "b 3"] = field(default_factory=lambda: np.zeros((0, 3)))
+
+
+@dataclass(frozen=True, kw_only=True)
 class Skipped:
     """Something in a scan that was left out, and why."""
 

@@ -15,6 +15,7 @@ from more2_jax.meshing import object_mesh
 from more2_jax.meshing.object_mesh import object_floor
 from more2_jax.registration import search, surface
 from more2_jax.scene import add_scan, reconstruct, start_scene
+from more2_jax.tracking.accumulated import accumulated_object
 from more2_jax.tracking.changes import moved_probability
 from more2_jax.tracking.objects import points_of
 from more2_jax.types import Instance, Mesh, Scan
@@ -253,6 +254,6 @@ def test_the_floor_under_an_object_is_that_of_its_room(scene, lowest, settings, 
     o = dataclasses.replace(scene.objects[0], points=points, point_scan=np.zeros(500, int))
     config = dataclasses.replace(preset("robust", upright=True), **settings)
     scans = [dataclasses.replace(scene.scans[0], background=b) for b in (room, np.zeros((0, 3)))]
-    found = object_floor(o, scans[:1], config)
+    found = object_floor(accumulated_object(o, scans[:1]), config)
     assert found == (None if floor is None else pytest.approx(floor, abs=2e-3))
-    assert object_floor(o, scans[1:], config) is None
+    assert object_floor(accumulated_object(o, scans[1:]), config) is None

@@ -1,7 +1,7 @@
 """The surface of one object (paper §3.4): the decoder's field, corrected where the surface was seen, as a mesh.
 
 `extract` is marching cubes from coarse to fine; the others say where observed points, free space and floor put it.
-May import `tracking`, `network`, `geometry`, `config`, `types`.
+May import `network`, `geometry`, `config`, `types`.
 """
 
 from typing import TYPE_CHECKING

@@ -1,10 +1,10 @@
-"""Mesh of one object of a living scene: its inlier points, its floor, its query box, then extraction (paper §3.4)."""
+"""Mesh of one accumulated object: its inlier points, its floor, its query box, then extraction (paper §3.4)."""
 
 from __future__ import annotations
 
 import dataclasses
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -12,14 +12,12 @@ from jaxtyping import Float
 
 from more2_jax.config import SceneConfig
 from more2_jax.geometry.floor import floor_height
+from more2_jax.geometry.observations import seen_from
 from more2_jax.geometry.outliers import inliers
-from more2_jax.geometry.poses import apply_pose
 from more2_jax.meshing.extract import HALF_WIDTH, extract_mesh, observed_level
 from more2_jax.meshing.observed_surface import uniform_subsample
 from more2_jax.network.prior import Prior
-from more2_jax.tracking.object_views import seen_from
-from more2_jax.tracking.objects import accumulated, accumulated_points, reference_pose
-from more2_jax.types import Mesh, ScanRecord, SceneObject
+from more2_jax.types import AccumulatedObject, Mesh
 
 # An object stands on another floor than the visible one where more than so many of its points lie clearly below that.
 BELOW_FLOOR_SHARE = 0.02
@@ -33,66 +31,64 @@ MESHES_AT_ONCE = 8
 
 
 def object_meshes(
-    prior: Prior, objects: Sequence[SceneObject], scans: Sequence[ScanRecord], config: SceneConfig
+    prior: Prior, objects: Iterable[AccumulatedObject], config: SceneConfig
 ) -> Iterator[Mesh | None]:
     """The objects' meshes in their order, `MESHES_AT_ONCE` worked on side by side: most steps keep one core busy."""
     with ThreadPoolExecutor(min(MESHES_AT_ONCE, os.cpu_count() or 1)) as pool:
-        yield from pool.map(lambda o: object_mesh(prior, o, scans, config), objects)
+        yield from pool.map(lambda o: object_mesh(prior, o, config), objects)
 
 
-def object_mesh(
-    prior: Prior, o: SceneObject, scans: Sequence[ScanRecord], config: SceneConfig
-) -> Mesh | None:
+def object_mesh(prior: Prior, o: AccumulatedObject, config: SceneConfig) -> Mesh | None:
     """The object's mesh in its reference frame, meters; None where its field has no surface.
 
-    The query box holds all that was seen of the object; nothing lies below the floor of its reference scan. `level`
+    The query box holds all that was seen of the object; nothing lies below the floor it was first seen on. `level`
     "observed": seen points lie on the surface, so the field's median there is its bias, and is taken off.
     """
     meshing = config.meshing
-    points, sensors = inlier_points(o, scans, config)
+    points, sensors = inlier_points(o, config)
     level = observed_level(prior, o.embedding, points) if meshing.level == "observed" else 0.0
     if not in_several_scans(o):
         meshing = dataclasses.replace(meshing, screening_length_multi_scan=0.0)
-    half_width, floor = box_half_width(o), object_floor(o, scans, config)
+    half_width, floor = box_half_width(o), object_floor(o, config)
     return extract_mesh(prior, o.embedding, meshing, half_width, level, points, floor, sensors)
 
 
-def object_floor(o: SceneObject, scans: Sequence[ScanRecord], config: SceneConfig) -> float | None:
-    """Height of the floor in an object's frame, meters, by the background of its reference scan.
+def object_floor(o: AccumulatedObject, config: SceneConfig) -> float | None:
+    """Height of the floor in an object's frame, meters, by the room it was first seen in.
 
     None if it is not asked for, there is none to see, or the object was seen clearly below it: then it is another's.
     """
     if not (config.upright and config.meshing.clip_to_floor):
         return None
-    floor = floor_height(apply_pose(reference_pose(o), scans[o.reference_scan].background))
+    floor = floor_height(o.background)
     if floor is None:
         return None
-    lowest = float(np.quantile(accumulated_points(o)[:, 2], BELOW_FLOOR_SHARE))
+    lowest = float(np.quantile(o.points[:, 2], BELOW_FLOOR_SHARE))
     return None if lowest < floor - BELOW_FLOOR_M else floor
 
 
-def in_several_scans(o: SceneObject) -> bool:
+def in_several_scans(o: AccumulatedObject) -> bool:
     """Whether several scans make up its shape."""
-    return len(accumulated(o)) > 1
+    return len(o.poses) > 1
 
 
 def inlier_points(
-    o: SceneObject, scans: Sequence[ScanRecord], config: SceneConfig
+    o: AccumulatedObject, config: SceneConfig
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n s 3"] | None]:
     """A uniform subsample of an object's points without outliers, in its frame; and the sensors that may see them.
 
     No sensors where they are not known, or not asked for.
     """
     meshing = config.meshing
-    points = uniform_subsample(accumulated_points(o))
-    sensors = seen_from(o, scans) if meshing.mls_bandwidth else None
+    points = uniform_subsample(o.points)
+    sensors = seen_from(o) if meshing.mls_bandwidth else None
     factor = meshing.outlier_factor_multi_scan if in_several_scans(o) else meshing.outlier_factor
     kept = inliers(points, factor)
     return points[kept], None if sensors is None else uniform_subsample(sensors)[kept]
 
 
-def box_half_width(o: SceneObject) -> float:
+def box_half_width(o: AccumulatedObject) -> float:
     """Half the edge of the query box, canonical units: at least the usual, and all of what was seen."""
     center = o.embedding.scan_center()
-    reach = np.quantile(np.abs(accumulated_points(o) - center).max(axis=1), BOX_QUANTILE)
+    reach = np.quantile(np.abs(o.points - center).max(axis=1), BOX_QUANTILE)
     return float(np.clip(BOX_MARGIN * reach / float(o.embedding.scale), HALF_WIDTH, MAX_BOX * HALF_WIDTH))

@@ -1,4 +1,4 @@
-"""Joint optimization of a scene's objects (paper §3.5): records to one padded batch, and back."""
+"""Joint optimization of accumulated objects (paper §3.5): one padded batch of all, and back."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ import jaxlie
 import numpy as np
 
 from more2_jax.config import SceneConfig
+from more2_jax.geometry.observations import own_points, with_poses
 from more2_jax.geometry.padding import bucket
-from more2_jax.geometry.poses import Pose, apply_pose, local_poses, world_poses
+from more2_jax.geometry.poses import local_poses, world_poses
 from more2_jax.network.embedding_batch import (
-    embed,
     padded,
     stack,
     unstack,
@@ -22,64 +22,46 @@ from more2_jax.network.embedding_batch import (
 from more2_jax.network.prior import Prior, encode
 from more2_jax.refinement.joint import Observations, fit_jointly
 from more2_jax.registration.pair_batch import about
-from more2_jax.tracking.objects import accumulated, accumulated_points, points_of
-from more2_jax.types import SceneObject
-
-
-def embed_accumulated(
-    prior: Prior, objects: Sequence[SceneObject], chosen: Sequence[int]
-) -> list[SceneObject]:
-    """Encodes the accumulated clouds of the `chosen` objects; the others stay as they are."""
-    result = list(objects)
-    if chosen:
-        for k, embedding in zip(
-            chosen, embed(prior, [accumulated_points(objects[k]) for k in chosen]), strict=True
-        ):
-            result[k] = dataclasses.replace(objects[k], embedding=embedding)
-    return result
+from more2_jax.types import AccumulatedObject
 
 
 def fit_objects(
-    prior: Prior, objects: Sequence[SceneObject], chosen: Sequence[int], config: SceneConfig
-) -> list[SceneObject]:
-    """Optimizes code and poses of the `chosen` objects over all their observations, in one call."""
-    result = list(objects)
-    if not chosen:
-        return result
-    seen, origins = padded_observations(prior, [objects[k] for k in chosen], config)
+    prior: Prior, objects: Sequence[AccumulatedObject], config: SceneConfig
+) -> list[AccumulatedObject]:
+    """Optimizes code and poses of objects over all their observations, in one call."""
+    if not objects:
+        return []
+    seen, origins = padded_observations(prior, objects, config)
     fit = jax.device_get(fit_jointly(prior, seen, config.joint))
-    embeddings = unstack(fit.embedding, len(chosen))
-    for n, k in enumerate(chosen):
-        local = [
-            jax.tree.map(lambda x, n=n, j=j: x[n, j], fit.T_ref_obs)
-            for j in range(len(accumulated(objects[k])))
-        ]
+    result = []
+    for n, (o, embedding) in enumerate(zip(objects, unstack(fit.embedding, len(objects)), strict=True)):
+        local = [jax.tree.map(lambda x, n=n, j=j: x[n, j], fit.T_ref_obs) for j in range(len(o.poses))]
         poses = [world_poses(T, origins[n, 0], origins[n, j]) for j, T in enumerate(local)]
-        embedding = dataclasses.replace(embeddings[n], origin=origins[n, 0])
-        result[k] = dataclasses.replace(with_poses(objects[k], poses), embedding=embedding)
+        own = dataclasses.replace(embedding, origin=origins[n, 0])
+        result.append(dataclasses.replace(with_poses(o, poses), embedding=own))
     return result
 
 
 def padded_observations(
-    prior: Prior, objects: Sequence[SceneObject], config: SceneConfig
+    prior: Prior, objects: Sequence[AccumulatedObject], config: SceneConfig
 ) -> tuple[Observations, np.ndarray]:
-    """Every accumulated observation as one batch (objects, observations, …), and their float64 origins.
+    """Every observation as one batch (objects, observations, …), and their float64 origins.
 
     Rows that are padding repeat an object's first observation, or the first object.
     """
-    most = bucket(max(len(accumulated(o)) for o in objects), 2)
+    most = bucket(max(len(o.poses) for o in objects), 2)
     together, _ = stack([o.embedding for o in objects])
     rows = [*objects, *[objects[0]] * (len(together.scale) - len(objects))]
-    clouds = [[points_of(o, seen) for seen in accumulated(o)] for o in rows]
+    clouds = [[own_points(o, j) for j in range(len(o.poses))] for o in rows]
     # The j-th observations of all objects are one batch: as large as a scan's instances, whose program encodes it.
     batches = [padded([row[j] if j < len(row) else row[0] for row in clouds]) for j in range(most)]
     codes = [jax.device_get(encode(prior, batch)) for batch in batches]
     origins = np.stack([np.asarray(batch.origin) for batch in batches], axis=1)
     poses = np.tile([1.0, 0, 0, 0, 0, 0, 0], (len(rows), most, 1))
     for n, o in enumerate(objects):
-        for j, seen in enumerate(accumulated(o)):
-            poses[n, j] = local_poses(seen.T_ref_scan, origins[n, 0], origins[n, j]).wxyz_xyz
-    times_seen = np.array([len(accumulated(o)) for o in objects] + [1] * (len(rows) - len(objects)))
+        for j, T_ref_scan in enumerate(o.poses):
+            poses[n, j] = local_poses(T_ref_scan, origins[n, 0], origins[n, j]).wxyz_xyz
+    times_seen = np.array([len(o.poses) for o in objects] + [1] * (len(rows) - len(objects)))
 
     def side_by_side(*columns: Any) -> Any:
         return jax.tree.map(lambda *x: np.stack(x, axis=1), *columns)
@@ -92,15 +74,3 @@ def padded_observations(
         T_ref_obs=jaxlie.SE3(poses.astype(np.float32)),  # type: ignore[arg-type]
         accumulated=about(together, origins[:, 0]),
     ), origins
-
-
-def with_poses(o: SceneObject, poses: Sequence[Pose]) -> SceneObject:
-    """The object with other poses of its accumulated observations, one each; its cloud follows."""
-    points, posed = o.points.copy(), iter(poses)
-    observations = []
-    for seen in o.observations:
-        T = next(posed) if seen.accumulated else seen.T_ref_scan
-        if seen.accumulated:
-            points[o.point_scan == seen.scan] = apply_pose(T, points_of(o, seen))
-        observations.append(dataclasses.replace(seen, T_ref_scan=T))
-    return dataclasses.replace(o, points=points, observations=tuple(observations))

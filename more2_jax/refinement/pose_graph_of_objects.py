@@ -1,10 +1,11 @@
-"""Pose-graph optimization of a scene's objects, before their meshes are made: records to batches, and back."""
+"""Pose-graph optimization of accumulated objects, before their meshes are made: batches of them, and back."""
 
 from __future__ import annotations
 
+import dataclasses
 import os
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 
 import jax
@@ -12,18 +13,17 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from more2_jax.config import SceneConfig
+from more2_jax.geometry.observations import seen_from, with_poses
 from more2_jax.geometry.outliers import inliers
 from more2_jax.geometry.padding import bucket
 from more2_jax.geometry.poses import Pose
 from more2_jax.meshing.extract import lowest_height, observed_surface
+from more2_jax.meshing.object_mesh import object_floor
 from more2_jax.meshing.observed_surface import ObservedSurface, uniform_subsample
-from more2_jax.network.embedding_batch import SMALLEST_BATCH
+from more2_jax.network.embedding_batch import SMALLEST_BATCH, embed
 from more2_jax.network.prior import Prior
-from more2_jax.refinement.joint_of_objects import embed_accumulated, with_poses
 from more2_jax.refinement.pose_graph import OrientedObservations, optimize_pose_graphs
-from more2_jax.tracking.object_views import seen_from
-from more2_jax.tracking.objects import accumulated, accumulated_points
-from more2_jax.types import ScanRecord, SceneObject
+from more2_jax.types import AccumulatedObject
 
 # Of an observation: points that planes are laid through (4,096 leave poses of exact points twice as far off, see "What
 # a mesh costs" in docs/design_notes.md), and of these the ones that are compared with the other observations'.
@@ -36,26 +36,16 @@ MAX_TURN_DEG = 3.0
 
 
 def refine_object_poses(
-    prior: Prior,
-    objects: Sequence[SceneObject],
-    chosen: Sequence[int],
-    scans: Sequence[ScanRecord],
-    floors: Mapping[int, float | None],
-    config: SceneConfig,
-) -> list[SceneObject]:
-    """The `chosen` objects with poses of their observations that agree with one another, the first held.
+    prior: Prior, objects: Sequence[AccumulatedObject], config: SceneConfig
+) -> list[AccumulatedObject]:
+    """The objects with poses of their observations that agree with one another, the first held.
 
-    `floors`: the height of each chosen object's floor in its frame, meters, None where it is not known. Without
-    `meshing.mls_bandwidth` there are no planes to compare; then all stays as it is. Where codes are of all that was
-    accumulated, they are made anew.
+    Without `meshing.mls_bandwidth` there are no planes to compare; then all stays as it is. Where codes are of all
+    that was accumulated, they are made anew.
     """
     result = list(objects)
     with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
-        surfaces = list(
-            pool.map(
-                lambda k: list(observation_surfaces(prior, objects[k], scans, floors[k], config)), chosen
-            )
-        )
+        surfaces = list(pool.map(lambda o: list(observation_surfaces(prior, o, config)), objects))
     batches: dict[int, list[int]] = defaultdict(list)  # by the number of observations, padded
     for n, row in enumerate(surfaces):
         batches[bucket(len(row), MIN_OBSERVATIONS)].append(n)
@@ -63,28 +53,29 @@ def refine_object_poses(
         batch = oriented_batch([surfaces[n] for n in rows], count)
         moved = jax.device_get(optimize_pose_graphs(batch, config.pose_graph.steps, config.motion))
         for n, motions in zip(rows, moved, strict=False):  # without the batch's padding
-            result[chosen[n]] = with_motions(objects[chosen[n]], motions, max_turn_deg(surfaces[n]))
-    return embed_accumulated(prior, result, chosen) if config.accumulate_target else result
+            result[n] = with_motions(objects[n], motions, max_turn_deg(surfaces[n]))
+    if not (config.accumulate_target and result):
+        return result
+    codes = embed(prior, [o.points for o in result])
+    return [dataclasses.replace(o, embedding=code) for o, code in zip(result, codes, strict=True)]
 
 
-def optimized_observations(o: SceneObject) -> list[int]:
-    """Which of an object's accumulated observations are optimized, its reference first."""
-    count = len(accumulated(o))
+def optimized_observations(o: AccumulatedObject) -> list[int]:
+    """Which of an object's observations are optimized, its first one first."""
+    count = len(o.poses)
     return [0, *range(max(1, count - MAX_OBSERVATIONS + 1), count)]
 
 
 def observation_surfaces(
-    prior: Prior, o: SceneObject, scans: Sequence[ScanRecord], floor: float | None, config: SceneConfig
+    prior: Prior, o: AccumulatedObject, config: SceneConfig
 ) -> Iterator[ObservedSurface | None]:
     """Oriented planes of what each of these observations saw, by its own points alone."""
-    points, sensors, seen = accumulated_points(o), seen_from(o, scans), accumulated(o)
-    scan = o.point_scan[np.isin(o.point_scan, [s.scan for s in seen])]
-    lowest = lowest_height(o.embedding, floor)
+    sensors, lowest = seen_from(o), lowest_height(o.embedding, object_floor(o, config))
     for k in optimized_observations(o):
-        own = uniform_subsample(np.flatnonzero(scan == seen[k].scan), SURFACE_POINTS)
-        own = own[inliers(points[own], config.meshing.outlier_factor)]
+        own = uniform_subsample(np.flatnonzero(o.observation == k), SURFACE_POINTS)
+        own = own[inliers(o.points[own], config.meshing.outlier_factor)]
         eyes = None if sensors is None else sensors[own]
-        yield observed_surface(prior, o.embedding, points[own], config.meshing, lowest, eyes)
+        yield observed_surface(prior, o.embedding, o.points[own], config.meshing, lowest, eyes)
 
 
 def max_turn_deg(surfaces: Sequence[ObservedSurface | None]) -> float:
@@ -111,14 +102,14 @@ def oriented_batch(rows: Sequence[Sequence[ObservedSurface | None]], most: int) 
     return OrientedObservations(points=points, normals=normals, mask=mask, residual=residual)  # type: ignore[arg-type]
 
 
-def with_motions(o: SceneObject, motions: np.ndarray, max_turn_deg: float) -> SceneObject:
+def with_motions(o: AccumulatedObject, motions: np.ndarray, max_turn_deg: float) -> AccumulatedObject:
     """The object with its observations moved, in canonical units about its center; its cloud follows.
 
     A motion that is not finite, or turns farther than `max_turn_deg`, is none.
     """
     scale = float(o.embedding.scale)
     center = o.embedding.scan_center()
-    poses: list[Pose] = [seen.T_ref_scan for seen in accumulated(o)]
+    poses: list[Pose] = list(o.poses)
     for j, k in enumerate(optimized_observations(o)):
         T = np.asarray(motions[j], np.float64)
         if not j or not np.isfinite(T).all():

@@ -1,6 +1,6 @@
 """A new scan against the objects known so far: its frame, who is who in it, and what each object gains.
 
-Turns scene records into observed objects for the stages below, and what these answer into records.
+Turns scene records into observed and accumulated objects, and what the stages answer into records.
 May import `matching`, `registration`, `network`, `geometry`, `config`, `types`.
 """
 

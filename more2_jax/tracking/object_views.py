@@ -5,13 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Float
 
 from more2_jax.geometry.free_space import sight_of, spread, stacked, view_of
 from more2_jax.geometry.poses import Points, apply_pose
 from more2_jax.geometry.transform import transform
 from more2_jax.tracking.objects import accumulated, accumulated_points, points_of
-from more2_jax.types import Instance, Observation, Scan, ScanRecord, SceneObject, Sight
+from more2_jax.types import Instance, Scan, ScanRecord, SceneObject, Sight
 
 SENSORS = 64  # of a scan that are remembered
 
@@ -52,24 +51,3 @@ def _object_sight(o: SceneObject, scans: Sequence[ScanRecord], rooms: dict[int, 
         if view is not None:
             views.append(transform(view, seen.T_ref_scan))
     return stacked(views)
-
-
-def seen_from(o: SceneObject, scans: Sequence[ScanRecord]) -> Float[np.ndarray, "n s 3"] | None:
-    """Of every accumulated point, the places of the sensors that may have seen it, in the object's frame.
-
-    `VIEWS` of a scan at most; NaN fills up. None where no sensor is known.
-    """
-    eyes = {seen.scan: _eyes(o, seen, scans[seen.scan]) for seen in accumulated(o)}
-    most = max(len(e) for e in eyes.values())
-    if not most:
-        return None
-    of_scan = np.full((max(eyes) + 1, most, 3), np.nan)
-    for scan, places in eyes.items():
-        of_scan[scan, : len(places)] = places
-    return of_scan[o.point_scan[np.isin(o.point_scan, list(eyes))]]
-
-
-def _eyes(o: SceneObject, seen: Observation, scan: ScanRecord) -> Points:
-    """The sensors of an observation that lie farthest apart, in the object's frame."""
-    places = apply_pose(seen.T_ref_scan, scan.sensors)
-    return places[spread(list(places), accumulated_points(o).mean(axis=0))]

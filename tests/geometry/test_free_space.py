@@ -24,6 +24,7 @@ from more2_jax.geometry.free_space import (
     sight_of,
     spread,
 )
+from more2_jax.geometry.observations import seen_from
 from more2_jax.geometry.point_to_plane import whole_surface
 from more2_jax.geometry.transform import rescale, transform
 from more2_jax.registration.pose_costs import CLEARLY, free_space_cost
@@ -31,7 +32,8 @@ from more2_jax.scans.read_scan import read_scan
 from more2_jax.scene import add_scan, start_scene
 from more2_jax.storage.scene_folder import load_scene, save_scene
 from more2_jax.tracking import relocalize
-from more2_jax.tracking.object_views import object_sights, seen_from
+from more2_jax.tracking.accumulated import accumulated_object
+from more2_jax.tracking.object_views import object_sights
 from more2_jax.tracking.objects import seen_again
 from more2_jax.types import Instance, Scan
 
@@ -257,8 +259,10 @@ def test_an_objects_views_are_of_all_that_make_up_its_shape(tiny_prior):
     (one,) = object_sights([doubted], records)
     np.testing.assert_allclose(one.eye, sensors)
     count = len(doubted.points) // 2
-    np.testing.assert_allclose(seen_from(doubted, records), np.tile(sensors, (count, 1, 1)))
-    places = seen_from(twice, records)
+    np.testing.assert_allclose(
+        seen_from(accumulated_object(doubted, records)), np.tile(sensors, (count, 1, 1))
+    )
+    places = seen_from(accumulated_object(twice, records))
     np.testing.assert_allclose(places[[0, count - 1], 0], [[0.0, -4.0, 1.5]] * 2)
     np.testing.assert_allclose(places[[count, -1], 0], [[-0.5, -4.0, 1.5]] * 2)
 

@@ -20,6 +20,8 @@ LONGEST_FILE, LONGEST_FUNCTION = 400, 40  # lines
 STAGES = ("geometry", "network", "registration", "matching", "tracking", "meshing", "refinement")
 # Weights are files: these alone read and write any.
 READ_WEIGHTS = {f"more2_jax.network.{m}" for m in ("prior", "torch_checkpoint", "parity")}
+# What is kept of scans and objects; stages below tracking take observed or accumulated objects.
+SCENE_RECORDS = {"SceneObject", "ScanRecord", "LivingScene"}
 FILE_NAMES = {"open", "Path", "pathlib", "io", "shutil", "tempfile"}
 
 SETTINGS = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]
@@ -125,6 +127,21 @@ def test_modules_say_what_they_are(path):
     words = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or ""
     assert len(words) > 10
     assert "TODO" not in words
+
+
+@pytest.mark.parametrize("path", [p for p in STAGE_FILES if p.parent.name != "tracking"], ids=name_of)
+def test_only_tracking_knows_the_records_of_a_scene(path):
+    assert used_names(path.read_text(encoding="utf-8")) & SCENE_RECORDS == set()
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "eval" / "harness").rglob("*.py")), ids=name_of)
+def test_evaluation_forges_no_records_to_call_a_stage(path):
+    called = {
+        node.func.id
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Name)
+    }
+    assert called & (SCENE_RECORDS | {"record", "new_object", "seen_again"}) == set()
 
 
 def test_no_drawer_for_odds_and_ends():

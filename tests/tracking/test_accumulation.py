@@ -9,11 +9,13 @@ import pytest
 from factories import living_scene, turn_z
 from small_scenes import CONFIG, MARK, piece
 
+from more2_jax.geometry.observations import own_points, with_poses
 from more2_jax.geometry.poses import apply_pose
 from more2_jax.network.embedding_batch import embed
 from more2_jax.refinement.joint_of_objects import fit_objects
 from more2_jax.scene import add_scan, reconstruct, start_scene
 from more2_jax.storage.scene_folder import load_scene, save_scene
+from more2_jax.tracking.accumulated import accumulated_object, with_refined
 from more2_jax.tracking.objects import (
     accumulated,
     accumulated_points,
@@ -22,7 +24,7 @@ from more2_jax.tracking.objects import (
     seen_again,
 )
 from more2_jax.tracking.relocalize import known_object
-from more2_jax.types import Instance, Observation, Scan, SceneObject
+from more2_jax.types import Instance, Observation, Scan, ScanRecord, SceneObject
 
 TURNED = turn_z(np.pi, np.zeros(3), np.array([2.0, 0.0, 0.0]))  # back to front, elsewhere
 
@@ -66,11 +68,56 @@ def test_the_joint_fit_is_that_without_the_doubted_observation(tiny_prior):
         points=o.points[kept],
         point_scan=o.point_scan[kept],
     )
-    mine, its = fit_objects(tiny_prior, [o, without], [0, 1], CONFIG)
+    records = [ScanRecord(index=k, name="", source="", instances=(1,)) for k in range(3)]
+    both = [accumulated_object(x, records) for x in (o, without)]
+    mine, its = with_refined([o, without], [0, 1], fit_objects(tiny_prior, both, CONFIG))
     np.testing.assert_allclose(mine.embedding.inv, its.embedding.inv, atol=1e-5)
     np.testing.assert_array_equal(mine.observations[1].T_ref_scan, TURNED)
     np.testing.assert_allclose(mine.observations[2].T_ref_scan, its.observations[1].T_ref_scan, atol=1e-5)
     np.testing.assert_allclose(accumulated_points(mine), its.points, atol=1e-5)
+
+
+def test_an_accumulated_object_is_what_was_not_doubted_and_goes_back_without_a_change(tiny_prior):
+    rng = np.random.default_rng(0)
+    o = seen_twice_and_once_wrongly(tiny_prior)
+    shuffled = rng.permutation(len(o.points))
+    o = dataclasses.replace(o, points=o.points[shuffled], point_scan=o.point_scan[shuffled])
+    places = [rng.normal(size=(k, 3)) for k in (0, 3, 2)]
+    records = [
+        ScanRecord(index=k, name="", source="", instances=(1,), sensors=s, background=s)
+        for k, s in enumerate(places)
+    ]
+    found = accumulated_object(dataclasses.replace(o, reference_scan=2), records)
+    np.testing.assert_array_equal(found.points, accumulated_points(o))
+    np.testing.assert_array_equal(found.poses, [s.T_ref_scan for s in accumulated(o)])
+    for row, seen in enumerate(accumulated(o)):
+        np.testing.assert_array_equal(own_points(found, row), points_of(o, seen))
+        assert found.sensors[row] is places[seen.scan]
+    np.testing.assert_allclose(found.background, apply_pose(o.observations[2].T_ref_scan, places[2]))
+    (same,), (other,) = with_refined([o], [0], [found]), with_refined([o], [], [])
+    assert other is o
+    np.testing.assert_array_equal(same.points, o.points)
+    for a, b in zip(same.observations, o.observations, strict=True):
+        np.testing.assert_array_equal(a.T_ref_scan, b.T_ref_scan)
+
+
+def test_what_moves_is_written_back_and_what_is_doubted_stays(tiny_prior):
+    o = seen_twice_and_once_wrongly(tiny_prior)
+    records = [ScanRecord(index=k, name="", source="", instances=(1,)) for k in range(3)]
+    found = accumulated_object(o, records)
+    step = turn_z(0.1, np.zeros(3), np.array([0.1, 0, 0]))
+    moved = with_poses(found, [found.poses[0], step @ found.poses[1]])
+    (new,) = with_refined([o], [0], [moved])
+    np.testing.assert_allclose(new.points[o.point_scan == 2], apply_pose(step, o.points[o.point_scan == 2]))
+    for row, scan in ((0, 0), (1, 1)):
+        np.testing.assert_array_equal(new.observations[row].T_ref_scan, o.observations[row].T_ref_scan)
+        np.testing.assert_allclose(
+            new.points[o.point_scan == scan], o.points[o.point_scan == scan], atol=1e-12
+        )
+    np.testing.assert_array_equal(new.observations[2].T_ref_scan, moved.poses[1])
+    np.testing.assert_allclose(
+        points_of(new, new.observations[2]), points_of(o, o.observations[2]), atol=1e-9
+    )
 
 
 @pytest.mark.parametrize(("limit", "sure"), [(0.0, False), (1.0, True)])

@@ -15,6 +15,7 @@ from more2_jax.geometry.poses import apply_pose
 from more2_jax.meshing.object_mesh import object_floor
 from more2_jax.scene import add_scan, leveled_scan, start_scene
 from more2_jax.tracking import leveling
+from more2_jax.tracking.accumulated import accumulated_object
 from more2_jax.tracking.leveling import LEAST_TILT_DEG, as_given, level_of, leveled
 from more2_jax.tracking.objects import place_of, points_of
 from more2_jax.tracking.relocalize import known_object
@@ -137,7 +138,9 @@ def test_a_later_scan_is_compared_with_what_lies_level(tilted_scene, accumulate)
 def test_the_floor_under_an_object_of_a_tilted_scan_is_level_where_its_points_are(tilted_scene):
     config = preset("robust", upright=True)
     for o in tilted_scene.objects:
-        assert object_floor(o, tilted_scene.scans, config) == pytest.approx(FLOOR_M, abs=0.01)
+        assert object_floor(accumulated_object(o, tilted_scene.scans), config) == pytest.approx(
+            FLOOR_M, abs=0.01
+        )
 
 
 def test_level_scans_are_compared_to_the_last_bit_as_without_leveling(monkeypatch, tiny_prior, level_scene):
