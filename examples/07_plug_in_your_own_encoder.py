@@ -15,7 +15,6 @@ import more2_jax as m2
 from more2_jax.cli.demo_score import pose_error
 from more2_jax.config import CodeMatcher, SurfaceSearch
 from more2_jax.scans.demo import demo_ground_truth, demo_scan_paths
-from more2_jax.types import Observation
 
 prior = m2.load_prior("small")
 CHANNELS = prior.config.encoder.code  # as wide as the decoder of the prior expects
@@ -73,7 +72,6 @@ T_old_new = batch.to_world(found.T_target_source)
 errors = []
 for k in range(len(pairs)):
     if right[k]:
-        seen = Observation(scan=1, instance=0, T_ref_scan=T_old_new[k], score=1.0, rms_m=0.0, converged=True)
-        errors.append(pose_error(*names[k], seen, truth)[0])
+        errors.append(pose_error(*names[k], T_old_new[k], truth)[0])
         print(f"{truth.names[names[k][0].model]}: rotation error {errors[-1]:.1f}°")
 print(f"median rotation error of right matches: {np.median(errors):.1f}°")

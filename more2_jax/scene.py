@@ -148,11 +148,11 @@ def reconstruct(
     again = [k for k in todo if len(accumulated(objects[k])) > 1]
     align, fit = again if config.pose_graph.steps else [], again if config.joint.steps else []
     with staged(timing, progress, "close", len(align)):
-        several = list(accumulated_objects(objects, align, scene.scans))
-        objects = with_refined(objects, align, refine_object_poses(prior, several, config))
+        refined = refine_object_poses(prior, list(accumulated_objects(objects, align, scene.scans)), config)
+        objects = with_refined(objects, align, refined)
     with staged(timing, progress, "joint", len(fit)):
-        several = list(accumulated_objects(objects, fit, scene.scans))
-        objects = with_refined(objects, fit, fit_objects(prior, several, config))
+        fitted = fit_objects(prior, list(accumulated_objects(objects, fit, scene.scans)), config)
+        objects = with_refined(objects, fit, fitted)
     with staged(timing, progress, "mesh", len(todo)) as advance:
         meshes = object_meshes(prior, accumulated_objects(objects, todo, scene.scans), config)
         for done, (k, mesh) in enumerate(zip(todo, meshes, strict=True), start=1):

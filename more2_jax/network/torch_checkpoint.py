@@ -12,6 +12,7 @@ import zipfile
 from collections import OrderedDict
 from dataclasses import dataclass
 from functools import partial
+from io import BufferedIOBase
 from pathlib import Path
 from typing import IO, Any
 
@@ -72,7 +73,7 @@ class Inert:
 class DefusedUnpickler(pickle.Unpickler):
     """Resolves no name by importing it. Names it does not know are kept in `refused`."""
 
-    def __init__(self, file: IO[bytes]) -> None:
+    def __init__(self, file: IO[bytes] | BufferedIOBase) -> None:
         super().__init__(file)
         self.refused: set[str] = set()
 

@@ -42,7 +42,7 @@ def coarse_faces(mesh: Mesh, most: int) -> Int[np.ndarray, "f 3"]:
     """About `most` faces between vertices the mesh has: of those in one cell of a grid, the one nearest their mean."""
     if len(mesh.faces) <= most:
         return mesh.faces
-    owner, faces = _clustered(mesh, most)
+    owner, faces = _clustered(mesh, float(most))
     counts = np.bincount(owner)
     middle = np.stack([np.bincount(owner, mesh.vertices[:, k]) / counts for k in range(3)], axis=1)
     far = np.linalg.norm(mesh.vertices - middle[owner], axis=1)
