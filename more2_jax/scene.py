@@ -148,7 +148,8 @@ def reconstruct(
     again = [k for k in todo if len(accumulated(objects[k])) > 1]
     align, fit = again if config.pose_graph.steps else [], again if config.joint.steps else []
     with staged(timing, progress, "close", len(align)):
-        refined = refine_object_poses(prior, list(accumulated_objects(objects, align, scene.scans)), config)
+        several = list(accumulated_objects(objects, align, scene.scans))
+        refined = refine_object_poses(prior, several, config)
         objects = with_refined(objects, align, refined)
     with staged(timing, progress, "joint", len(fit)):
         fitted = fit_objects(prior, list(accumulated_objects(objects, fit, scene.scans)), config)

@@ -163,18 +163,18 @@ def test_reconstruction_gives_closed_frames_and_leaves_finished_objects_alone(ti
 def test_meshes_come_in_order_whichever_is_ready_first_and_errors_come_through(
     monkeypatch, tiny_prior, scene
 ):
-    waits = {o.id: 0.2 / (k + 1) for k, o in enumerate(scene.objects)}
+    waits = {id(o.embedding): 0.2 / (k + 1) for k, o in enumerate(scene.objects)}
 
-    def slow(prior, o, scans, config):
-        time.sleep(waits[o.id])
-        return Mesh(vertices=np.full((1, 3), waits[o.id]), faces=np.zeros((0, 3), int))
+    def slow(prior, o, config):
+        time.sleep(waits[id(o.embedding)])
+        return Mesh(vertices=np.full((1, 3), waits[id(o.embedding)]), faces=np.zeros((0, 3), int))
 
     monkeypatch.setattr(object_mesh, "object_mesh", slow)
-    config = dataclasses.replace(CONFIG, joint=JointConfig(steps=0))
+    config = dataclasses.replace(CONFIG, joint=JointConfig(steps=0), pose_graph=preset("paper").pose_graph)
     bare = dataclasses.replace(scene, objects=tuple(dataclasses.replace(o, mesh=None) for o in scene.objects))
     done = reconstruct(tiny_prior, bare, config)
-    assert [o.mesh.vertices[0, 0] for o in done.objects] == [waits[o.id] for o in scene.objects]
-    monkeypatch.setattr(object_mesh, "object_mesh", lambda prior, o, scans, config: 1 / 0)
+    assert [o.mesh.vertices[0, 0] for o in done.objects] == list(waits.values())
+    monkeypatch.setattr(object_mesh, "object_mesh", lambda prior, o, config: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         reconstruct(tiny_prior, bare, config)
 
@@ -193,7 +193,7 @@ def test_several_scans_confirm_one_another_one_does_not(monkeypatch, tiny_prior,
         dataclasses.replace(s, accumulated=s.scan == often.reference_scan) for s in often.observations
     )
     for o in (often, dataclasses.replace(often, observations=doubted)):
-        object_mesh.object_mesh(tiny_prior, o, scene.scans, ROBUST)
+        object_mesh.object_mesh(tiny_prior, accumulated_object(o, scene.scans), ROBUST)
     assert len(often.observations) == 3
     assert asked == [ROBUST.meshing.outlier_factor_multi_scan, 0.3, ROBUST.meshing.outlier_factor, 0.0]
 
@@ -251,7 +251,10 @@ def test_the_floor_under_an_object_is_that_of_its_room(scene, lowest, settings, 
     rng = np.random.default_rng(0)
     room = np.column_stack([rng.uniform(-3, 3, (4000, 2)), 0.002 * rng.normal(size=4000)])
     points = rng.uniform([-0.2, -0.2, lowest], [0.2, 0.2, lowest + 0.5], (500, 3))
-    o = dataclasses.replace(scene.objects[0], points=points, point_scan=np.zeros(500, int))
+    first = scene.objects[0].observations[:1]
+    o = dataclasses.replace(
+        scene.objects[0], observations=first, points=points, point_scan=np.zeros(500, int)
+    )
     config = dataclasses.replace(preset("robust", upright=True), **settings)
     scans = [dataclasses.replace(scene.scans[0], background=b) for b in (room, np.zeros((0, 3)))]
     found = object_floor(accumulated_object(o, scans[:1]), config)

@@ -274,10 +274,10 @@ def test_a_scan_without_sensors_leaves_its_points_without_places(tiny_prior):
     unknown = dataclasses.replace(records[0], index=1, sensors=np.zeros((0, 3)))
     again = dataclasses.replace(o.observations[0], scan=1)
     both = seen_again(o, Instance(id=1, points=o.points), again)
-    places = seen_from(both, (*records, unknown))
+    places = seen_from(accumulated_object(both, (*records, unknown)))
     assert places.shape == (len(both.points), 3, 3)
     assert np.isfinite(places[both.point_scan == 0]).all() and np.isnan(places[both.point_scan == 1]).all()
-    assert seen_from(o, (unknown,)) is None
+    assert seen_from(accumulated_object(o, (unknown,))) is None
 
 
 # --- where the places come from -----------------------------------------------------------------------------

@@ -104,12 +104,7 @@ def test_symmetric_objects_agree_by_their_place_alone():
         about[:3, :3] = Rotation.from_euler("z", rng.uniform(1, 5)).as_matrix()
         about[:3, 3] = c - about[:3, :3] @ c
         ways.append([T @ about])
-    votes = Votes(
-        T_scene_scan=np.array(ways).reshape(-1, 2, 4, 4),
-        center=center,
-        object=np.arange(4),
-        instance=np.arange(4),
-    )
+    votes = Votes(T_scene_scan=np.array(ways), center=center, object=np.arange(4), instance=np.arange(4))
     found = estimate(noisy(T, center.mean(0), rng, 0.01, 0.5, "upright"), votes, "upright")
     assert found.agreeing == 4
     np.testing.assert_allclose(found.T_scene_scan, T, atol=1e-6)
