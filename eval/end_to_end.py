@@ -22,6 +22,7 @@ from eval.harness.options import Options
 from eval.harness.results import finish
 from eval.harness.runs import run_scenes, start_run
 from eval.peers.end_to_end import NAME, combined
+from eval.scores.divided_masks import with_divided_masks
 from eval.scores.figures import Figure, Record, in_columns
 from eval.scores.tracks import Track, changes_f1, score_tracks, tracks_of
 from more2_jax.config import SceneConfig
@@ -118,6 +119,7 @@ def records_of(
     else:
         reason = ""
     seconds = time.perf_counter() - began
+    scene, tracks = with_divided_masks(scene, tracks)
     pairs = score_tracks(scene, tracks, right_deg, samples)
     whole: Record = {"seconds": seconds, "changes_f1": changes_f1(scene, tracks), "reason": reason}
     return [{"method": name, **r} for r in [*pairs, whole]]

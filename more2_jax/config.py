@@ -212,7 +212,9 @@ class SceneConfig:
     static_m: float = 0.05  # and moved by less, is static
     # Match and register against all seen so far, not the reference observation.
     accumulate_target: bool = False
-    repair_masks: bool = False  # join what masks split, where another scan saw it whole
+    repair_masks: bool = (
+        False  # join what masks split and divide what they merge, where another scan shows it
+    )
     accumulate_misfit: float = 1.0  # an observation whose registration fits worse is left out of the shape
     matching: Matcher = field(default_factory=CodeMatcher)
     registration: RegistrationMethod = field(default_factory=DescentRegistration)

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from functools import partial
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -23,11 +25,12 @@ from more2_jax.tracking.changes import changes_between, forgotten, not_seen_in
 from more2_jax.tracking.identify import Identified, identify
 from more2_jax.tracking.leveling import as_given, level_of, leveled
 from more2_jax.tracking.looked_at import not_looked_at
+from more2_jax.tracking.merged_masks import Divided, divide_merged
 from more2_jax.tracking.object_views import few_sensors, instance_sights, object_sights
 from more2_jax.tracking.objects import (
     SCENE_FRAME,
     accumulated,
-    new_object,
+    new_objects,
     next_number,
     seen_again,
 )
@@ -62,8 +65,8 @@ def start_scene(
     timing: dict[str, float] = {}
     with staged(timing, progress, "encode", len(instances), scan=scan.name):
         embeddings = embed(prior, [i.points for i in instances], [i.normals for i in instances])
-    objects = [new_object(k, 0, i, e) for k, (i, e) in enumerate(zip(instances, embeddings, strict=True))]
-    objects, frame = as_given(objects, 0, SCENE_FRAME, T_level_scan)
+    objects = new_objects(0, 0, range(len(instances)), instances, embeddings)
+    objects, frame = as_given(list(objects.values()), 0, SCENE_FRAME, T_level_scan)
     return LivingScene(
         preset=config.preset,
         prior=prior.name,
@@ -73,6 +76,33 @@ def start_scene(
         changes=(),
         timing_s=timing,
     )
+
+
+def who_is_who(
+    prior: Prior,
+    scene: LivingScene,
+    instances: Sequence[Instance],
+    scan: Scan,
+    config: SceneConfig,
+    stage: Callable[[str, int], AbstractContextManager[Any]],
+) -> tuple[Divided, list[tuple[ObservedObject, Pose]], list[ObservedObject], Identified]:
+    """The objects and a scan's instances, masks that hold two objects divided; both as compared; which are one."""
+    with stage("encode", len(instances)):
+        embeddings = embed(prior, [i.points for i in instances], [i.normals for i in instances])
+    whole = Divided(objects=list(scene.objects), instances=list(instances), embeddings=embeddings)
+    rooms = rooms_of(scene, scan)
+    with stage("match", len(instances)):
+        old, new = compared_objects(scene, instances, embeddings, scan, config)
+        identified = identify(prior, [o for o, _ in old], new, config, rooms)
+        divided = None
+        if config.repair_masks:
+            first = next_number(scene.objects, scene.scans)
+            divided = divide_merged(prior, whole, [o for o, _ in old], new, identified, config, first)
+        if divided is None:
+            return whole, old, new, identified
+        scene = dataclasses.replace(scene, objects=tuple(divided.objects))
+        old, new = compared_objects(scene, divided.instances, divided.embeddings, scan, config)
+        return divided, old, new, identify(prior, [o for o, _ in old], new, config, rooms)
 
 
 def add_scan(
@@ -85,18 +115,14 @@ def add_scan(
     """
     level, T_level_scan = leveled_scan(scan, config, scene.scans[0])
     instances, skipped = usable(level, config)
-    index, timing, objects = len(scene.scans), dict(scene.timing_s), list(scene.objects)
+    index, timing = len(scene.scans), dict(scene.timing_s)
     stage = partial(staged, timing, progress, scan=scan.name)
-    with stage("encode", len(instances)):
-        embeddings = embed(prior, [i.points for i in instances], [i.normals for i in instances])
-    with stage("match", len(instances)):
-        old, new = compared_objects(scene, instances, embeddings, level, config)
-        identified = identify(prior, [o for o, _ in old], new, config, rooms_of(scene, level))
+    whole, old, new, identified = who_is_who(prior, scene, instances, level, config, stage)
     found = identified.found
     with stage("register", len(found)):
-        seen, frame = relocalize(prior, objects, old, instances, new, identified, index, config)
+        seen, frame = relocalize(prior, whole.objects, old, whole.instances, new, identified, index, config)
     pairs = [(f.object, f.instance) for f in found if config.repair_masks]
-    mended = mend_splits(objects, instances, pairs, seen[: len(pairs)])
+    mended = mend_splits(whole.objects, whole.instances, pairs, seen[: len(pairs)])
     objects = mended.objects
     for f, observation in zip(found, seen, strict=True):
         objects[f.object] = seen_again(objects[f.object], mended.instances[f.instance], observation)
@@ -107,11 +133,12 @@ def add_scan(
     missing, left = mended.left_over([(f.object, f.instance) for f in found])
     unseen = not_looked_at(objects, missing, level, frame.T_scene_scan, config.upright)
     first = next_number(objects, scene.scans)
-    fresh = {i: new_object(first + n, index, instances[i], embeddings[i], frame) for n, i in enumerate(left)}
+    fresh = new_objects(first, index, left, whole.instances, [o.embedding for o in new], frame)
     chance = chances(identified, objects, fresh, config)
     objects, frame = as_given([*mended.whole(objects), *fresh.values()], index, frame, T_level_scan)
     scene = forgotten(scene, mended.absorbed)
-    scans = (*scene.scans, record(index, scan, instances, skipped, frame, unseen, mended.repairs))
+    repairs = (*whole.repairs, *whole.masks(found, fresh), *mended.repairs)
+    scans = (*scene.scans, record(index, scan, instances, skipped, frame, unseen, repairs))
     changes = changes_between(objects, index - 1, index, config, chance, not_seen_in(scans))
     changed = {"scans": scans, "objects": tuple(objects), "changes": (*scene.changes, changes)}
     return dataclasses.replace(scene, **changed, timing_s=timing)

@@ -260,3 +260,31 @@ def test_the_floor_under_an_object_is_that_of_its_room(scene, lowest, settings, 
     found = object_floor(accumulated_object(o, scans[:1]), config)
     assert found == (None if floor is None else pytest.approx(floor, abs=2e-3))
     assert object_floor(accumulated_object(o, scans[1:]), config) is None
+
+
+def in_one(s: Scan) -> Scan:
+    """The scan whose first two instances share one mask."""
+    first, second, *others = s.instances
+    both = dataclasses.replace(first, points=np.concatenate([first.points, second.points]))
+    return dataclasses.replace(s, instances=(both, *others))
+
+
+@pytest.mark.parametrize("merged_scan", [0, 1])
+def test_a_mask_that_holds_two_objects_is_divided_where_another_scan_shows_them_apart(
+    tiny_prior, merged_scan
+):
+    visits = [scan(n, {0: (0.0, 0.0), 1: (0.3, 3.0), 2: (0.1, -3.0)}) for n in "ab"]
+    visits[merged_scan] = in_one(visits[merged_scan])
+    made, kept = (
+        add_scan(tiny_prior, start_scene(tiny_prior, visits[0], c), visits[1], c)
+        for c in (CONFIG, dataclasses.replace(CONFIG, repair_masks=False))
+    )
+    assert [sorted(s.scan for s in o.observations) for o in made.objects] == [[0, 1]] * 3
+    assert not made.changes[0].added and not made.changes[0].removed
+    (repair,) = made.scans[1].repairs
+    assert repair.divided is not None and len(repair.instances) == merged_scan
+    masks = [o.observations[merged_scan].instance for o in made.objects]
+    assert sorted(masks.count(m) for m in set(masks)) == [1, 2]
+    assert sum(len(o.points) for o in made.objects) == sum(len(i.points) for v in visits for i in v.instances)
+    assert made.scans[merged_scan].instances == tuple(i.id for i in visits[merged_scan].instances)
+    assert kept.changes[0].added or kept.changes[0].removed

@@ -82,6 +82,7 @@ def known(o: TrueObject, T_scan_room: Sequence[Pose] = ()) -> KnownObject:
         mesh=Mesh(vertices=o.vertices, faces=o.faces),
         moved={k: bool(np.abs(T - reference).max() > 1e-6) for k, T in poses.items()},
         canonical=LONGEST / float(np.ptp(o.vertices, axis=0).max()),
+        shared={k: o.instance[k] for k in o.merged},
         parts={k: ids for k, ids in o.parts.items() if k not in o.merged and ids},
     )
 

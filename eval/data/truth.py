@@ -34,6 +34,9 @@ class KnownObject:
     parts: dict[int, tuple[int, ...]] = field(
         default_factory=dict
     )  # where masks are split: all that are mostly its own
+    shared: dict[int, int] = field(
+        default_factory=dict
+    )  # where it has no mask of its own: another's that holds it
 
     @property
     def first(self) -> int:

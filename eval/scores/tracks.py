@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Float
@@ -13,7 +14,7 @@ from eval.data.truth import KnownObject, KnownScene, Pose
 from eval.scores.figures import COLUMNS, Record
 from eval.scores.mesh_scores import RECONSTRUCTED, mesh_scores
 from eval.scores.pose_scores import failed_pose, pose_scores
-from more2_jax.tracking.objects import accumulated_points
+from more2_jax.tracking.objects import accumulated_points, points_of
 from more2_jax.types import LivingScene, Mesh
 
 
@@ -25,16 +26,25 @@ class Track:
     T_track_scan: dict[int, Pose]
     points: Float[np.ndarray, "n 3"]
     mesh: Mesh | None = None
+    halves: dict[int, Float[np.ndarray, "n 3"]] = field(
+        default_factory=dict
+    )  # of masks that hold another track too
 
 
 def tracks_of(scene: LivingScene) -> list[Track]:
     """The objects of a living scene."""
+    masks = Counter((seen.scan, seen.instance) for o in scene.objects for seen in o.observations)
     return [
         Track(
             instance={seen.scan: seen.instance for seen in o.observations},
             T_track_scan={seen.scan: seen.T_ref_scan for seen in o.observations},
             points=accumulated_points(o),
             mesh=o.mesh,
+            halves={
+                seen.scan: points_of(o, seen)
+                for seen in o.observations
+                if masks[seen.scan, seen.instance] > 1
+            },
         )
         for o in scene.objects
     ]

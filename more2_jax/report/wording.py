@@ -84,6 +84,11 @@ def leveled_text(scene: LivingScene, scan: ScanRecord) -> str | None:
 
 def repair_text(scan: ScanRecord, repair: Repair) -> str:
     """`friday: instances 3 and 5 are object_002, in parts (92 % on it)`."""
+    if repair.divided is not None:
+        both = f"{repair.object} and {repair.divided}"
+        if not repair.instances:
+            return f"{scan.name}: one mask of the scan before held {both}"
+        return f"{scan.name}: instance {repair.instances[0]} is {both} in one mask"
     sure = f"in parts ({repair.share:.0%} on it)"
     if repair.absorbed:
         return (

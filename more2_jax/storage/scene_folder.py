@@ -281,7 +281,7 @@ def _embeddings(path: Path) -> dict[str, Embedding]:
 
 def _repair(content: dict[str, Any]) -> Repair:
     lists = {k: tuple(content[k]) for k in ("instances", "absorbed")}
-    return Repair(object=content["object"], **lists, share=content["share"])
+    return Repair(object=content["object"], **lists, divided=content.get("divided"), share=content["share"])
 
 
 def _frame(content: dict[str, Any] | None) -> Frame:

@@ -68,7 +68,8 @@ def _where_any(**lists: list[Any]) -> dict[str, list[Any]]:
 
 def _repair_to_json(r: Repair) -> dict[str, Any]:
     lists = {"instances": [int(i) for i in r.instances], "absorbed": list(r.absorbed)}
-    return {"object": r.object, **lists, "share": float(r.share)}
+    divided = {} if r.divided is None else {"divided": r.divided}
+    return {"object": r.object, **lists, **divided, "share": float(r.share)}
 
 
 def _frame_to_json(frame: Frame, upright: bool) -> dict[str, Any]:

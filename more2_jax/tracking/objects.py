@@ -39,6 +39,20 @@ def new_object(
     )
 
 
+def new_objects(
+    first: int,
+    scan: int,
+    rows: Sequence[int],
+    instances: Sequence[Instance],
+    embeddings: Sequence[Embedding],
+    frame: Frame = SCENE_FRAME,
+) -> dict[int, SceneObject]:
+    """By row, an object of every instance in `rows`, numbered from `first` on."""
+    return {
+        row: new_object(first + n, scan, instances[row], embeddings[row], frame) for n, row in enumerate(rows)
+    }
+
+
 def next_number(objects: Sequence[SceneObject], scans: Sequence[ScanRecord]) -> int:
     """One that no object has or had: ids of objects that were parts of others are not given again."""
     ids = [o.id for o in objects] + [id_ for s in scans for r in s.repairs for id_ in r.absorbed]

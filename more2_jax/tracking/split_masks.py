@@ -138,9 +138,14 @@ def trusted(pose: Observation) -> bool:
 
 def share_on(whole: Points, part: Points) -> float:
     """Share of a part's points on the surface of a whole, both in one frame."""
-    radius = float(np.sqrt(((whole - whole.mean(axis=0)) ** 2).sum(axis=1).mean()))
-    distance, _ = KDTree(whole).query(part, distance_upper_bound=max(NEAR * radius, NEAR_M))
+    distance, _ = KDTree(whole).query(part, distance_upper_bound=reach_m(whole))
     return float(np.isfinite(distance).mean())
+
+
+def reach_m(whole: Points) -> float:
+    """So near its points lies what lies on a cloud."""
+    radius = float(np.sqrt(((whole - whole.mean(axis=0)) ** 2).sum(axis=1).mean()))
+    return max(NEAR * radius, NEAR_M)
 
 
 def joined(first: Instance, others: Sequence[Instance]) -> Instance:

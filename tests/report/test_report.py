@@ -389,9 +389,13 @@ def test_mended_masks_are_listed():
     repairs = (
         Repair(object="object_001", instances=(3, 5, 6), share=0.92),
         Repair(object="object_000", absorbed=("object_007",), share=0.8),
+        Repair(object="object_000", instances=(4,), divided="object_001"),
+        Repair(object="object_000", divided="object_008"),
     )
     scans = (*SCENE.scans[:-1], dataclasses.replace(SCENE.scans[-1], repairs=repairs))
     text = report_html(dataclasses.replace(SCENE, scans=scans), CONFIG)
     assert "friday: instances 3, 5 and 6 are object_001, in parts (92% on it)" in text
     assert "object_007 of the scan before and object_000 are one, in parts (80% on it)" in text
+    assert "friday: instance 4 is object_000 and object_001 in one mask" in text
+    assert "friday: one mask of the scan before held object_000 and object_008" in text
     assert "Masks are as they were given." in report_html(SCENE, CONFIG)

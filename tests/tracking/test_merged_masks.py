@@ -1,0 +1,88 @@
+"""Masks that hold two objects are divided where the other scan shows the halves apart; nothing else is."""
+
+import numpy as np
+import pytest
+from boxes import box, two_boxes
+
+from more2_jax.tracking.merged_masks import (
+    Division,
+    Part,
+    beside_of,
+    chosen,
+    compatible,
+    larger_first,
+)
+from more2_jax.types import Embedding
+
+
+def agreement(side, true):
+    return max((side == true).mean(), (side != true).mean())
+
+
+def test_beside_a_thing_is_what_does_not_lie_on_it():
+    points, true = two_boxes(0.3)
+    wide = box(9, [1.0, 0.6, 0.7], [0, 0, 0], 2000)
+    assert agreement(beside_of(wide, points), ~true) > 0.98
+    assert beside_of(wide, points)[~true].all()
+
+
+def test_the_larger_side_comes_first():
+    rows = np.arange(5) < 2
+    for side in (rows, ~rows):
+        assert [r.sum() for r in larger_first(side)] == [3, 2]
+
+
+CODE = Embedding(inv=np.ones(2), eqv=np.ones((3, 2)), scale=np.float32(1.0), center=np.zeros(3))
+
+
+def pair(whole=0, narrow=False):
+    sides = np.arange(10) < 7, np.arange(10) >= 7
+    return tuple(Part(whole=whole, rows=s, embedding=CODE, narrow=narrow) for s in sides)
+
+
+def decided(odds, *, partner=None, now=0.0, narrow=False, scale=(1.0, 1.0, 1.0)):
+    """What becomes of one mask whose halves have `odds` (others, 2)."""
+    odds = np.asarray(odds, float)
+    partner = {} if partner is None else {0: partner}
+    left = [k for k in range(len(odds)) if k not in partner.values()]
+    before = np.full((1, len(odds)), now)
+    halves = [pair(narrow=narrow)]
+    return chosen(halves, partner, left, scale[: len(odds)], before, lambda _, others: odds[others])
+
+
+def test_halves_that_are_two_known_things_are_two():
+    (d,) = decided([[3, -5], [-5, 3], [1, 1]])
+    assert d.others == (0, 1)
+    assert d.gain == pytest.approx(6)
+
+
+@pytest.mark.parametrize(
+    ("odds", "options"),
+    [
+        ([[1.5, -5], [-5, 1.5]], {}),  # too little
+        ([[9, -5], [-5, -5]], {}),  # only one half is known, and they do not hang by a thread
+        ([[9, 9], [-5, -5]], {}),  # both are the same one
+        ([[3, -5], [-5, 3]], {"partner": 0, "now": 2.5}),  # the whole is nearly as likely
+        ([[9, -5], [-5, 9]], {"scale": (0.2, 1.0)}),  # of another size
+    ],
+)
+def test_other_masks_stay_whole(odds, options):
+    assert decided(odds, **options) == []
+
+
+def test_what_hangs_by_a_thread_is_divided_for_one_known_half():
+    (d,) = decided([[-5, 3], [-5, -5]], narrow=True)
+    assert d.others == (None, 0)
+
+
+def test_no_cloud_is_divided_or_named_twice_and_the_best_come_first():
+    def division(whole, others, gain):
+        return Division(parts=pair(whole), others=others, gain=gain)
+
+    best, clash, again, free = (
+        division(0, (0, None), 9.0),
+        division(1, (0, 3), 8.0),
+        division(0, (4, 5), 7.0),
+        division(2, (None, 6), 3.0),
+    )
+    assert compatible([free, again, clash, best]) == [best, free]
