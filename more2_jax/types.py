@@ -72,9 +72,8 @@ class PointCloud:
 
     points: Float[Array, "*batch n 3"] = quantity("position")  # meters, relative to `origin`
     mask: Bool[Array, "*batch n"] = quantity("invariant")  # True where the point is real
-    origin: Float[Array | np.ndarray, "*batch 3"] | None = quantity(
-        "origin", default=None
-    )  # in the scan's frame
+    # In the scan's frame.
+    origin: Float[Array | np.ndarray, "*batch 3"] | None = quantity("origin", default=None)
     # Unit normals of the surface, outward; zeros where not known. None: nowhere.
     normals: Float[Array, "*batch n 3"] | None = quantity("direction", default=None)
 
@@ -177,9 +176,8 @@ class Registration:
     loss: Float[Array, "*batch"] = quantity("invariant")  # what was minimized, at this very pose
     # Trimmed root mean square of nearest distances, both ways, meters.
     rms_m: Float[Array, "*batch"] = quantity("length")
-    converged: Bool[Array, "*batch"] = quantity(
-        "invariant"
-    )  # the pose stopped moving and explains both clouds
+    # The pose stopped moving and explains both clouds.
+    converged: Bool[Array, "*batch"] = quantity("invariant")
     # The rest only of `SurfaceRegistration`.
     # Of the surfaces: 0 none, 1 nothing of both clouds agrees.
     misfit: Float[Array, "*batch"] | None = quantity("invariant", default=None)
@@ -237,9 +235,8 @@ class ObservedObject:
     points: Float[np.ndarray, "_ 3"] = quantity("position")  # meters, float64
     embedding: Embedding = quantity("record")  # NumPy leaves, unbatched
     color: Color | None = quantity("invariant", default=None)
-    sight: Sight | None = quantity(
-        "record", default=None
-    )  # what sensors saw around it, where their places are known
+    # What sensors saw around it, where their places are known.
+    sight: Sight | None = quantity("record", default=None)
 
 
 @dataclass(frozen=True, kw_only=True)
