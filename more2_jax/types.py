@@ -359,9 +359,8 @@ class Repair:
     object: str  # id of the whole
     instances: tuple[int, ...] = ()  # of the scan, that are parts of it, the one that was matched first
     absorbed: tuple[str, ...] = ()  # ids that parts of it had in the scene before
-    divided: str | None = (
-        None  # id of the other object that one mask held; `instances`: that mask, of this scan
-    )
+    # Id of the other object that one mask held; `instances` is then that mask, of this scan.
+    divided: str | None = None
     share: float = 1.0  # of the part, that lies on the whole
 
 

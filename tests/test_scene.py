@@ -103,6 +103,14 @@ def test_identical_copies_are_matched_one_to_one_and_flagged(tiny_prior):
     assert made.changes[0].static == tuple(o.id for o in made.objects)
 
 
+def mended_and_kept(prior, visits: list[Scan]):
+    """The scene of two scans with masks repaired, and with masks as they are."""
+    return (
+        add_scan(prior, start_scene(prior, visits[0], c), visits[1], c)
+        for c in (CONFIG, dataclasses.replace(CONFIG, repair_masks=False))
+    )
+
+
 def in_parts(s: Scan) -> Scan:
     """The scan whose first instance falls into two, of which the smaller has the id 99."""
     first, *others = s.instances
@@ -115,10 +123,7 @@ def in_parts(s: Scan) -> Scan:
 def test_a_mask_in_parts_is_one_object_where_another_scan_shows_it_whole(tiny_prior, split_scan):
     visits = [scan(n, {0: (0.0, 0.0), 1: (0.3, 3.0)}) for n in "ab"]
     visits[split_scan] = in_parts(visits[split_scan])
-    made, kept = (
-        add_scan(tiny_prior, start_scene(tiny_prior, visits[0], c), visits[1], c)
-        for c in (CONFIG, dataclasses.replace(CONFIG, repair_masks=False))
-    )
+    made, kept = mended_and_kept(tiny_prior, visits)
     assert [sorted(s.scan for s in o.observations) for o in made.objects] == [[0, 1]] * 2
     assert not made.changes[0].added and not made.changes[0].removed
     (repair,) = made.scans[1].repairs
@@ -275,10 +280,7 @@ def test_a_mask_that_holds_two_objects_is_divided_where_another_scan_shows_them_
 ):
     visits = [scan(n, {0: (0.0, 0.0), 1: (0.3, 3.0), 2: (0.1, -3.0)}) for n in "ab"]
     visits[merged_scan] = in_one(visits[merged_scan])
-    made, kept = (
-        add_scan(tiny_prior, start_scene(tiny_prior, visits[0], c), visits[1], c)
-        for c in (CONFIG, dataclasses.replace(CONFIG, repair_masks=False))
-    )
+    made, kept = mended_and_kept(tiny_prior, visits)
     assert [sorted(s.scan for s in o.observations) for o in made.objects] == [[0, 1]] * 3
     assert not made.changes[0].added and not made.changes[0].removed
     (repair,) = made.scans[1].repairs

@@ -392,8 +392,8 @@ def test_mended_masks_are_listed():
         Repair(object="object_000", instances=(4,), divided="object_001"),
         Repair(object="object_000", divided="object_008"),
     )
-    scans = (*SCENE.scans[:-1], dataclasses.replace(SCENE.scans[-1], repairs=repairs))
-    text = report_html(dataclasses.replace(SCENE, scans=scans), CONFIG)
+    mended = dataclasses.replace(SCENE.scans[-1], repairs=repairs)
+    text = report_html(dataclasses.replace(SCENE, scans=(*SCENE.scans[:-1], mended)), CONFIG)
     assert "friday: instances 3, 5 and 6 are object_001, in parts (92% on it)" in text
     assert "object_007 of the scan before and object_000 are one, in parts (80% on it)" in text
     assert "friday: instance 4 is object_000 and object_001 in one mask" in text

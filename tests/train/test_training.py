@@ -16,8 +16,9 @@ from places import ROOT
 from sphere_shards import sphere_shards
 
 from more2_jax.config import load_config
+from more2_jax.network.prior import init_prior
 from train.run.journal import Journal, read_log
-from train.run.pictures import EYE, splat
+from train.run.pictures import EYE, PIXELS, held_out, splat
 from train.run.schedule import learning_rate
 from train.run.settings import TrainingRun
 from train.run.shape_mix import load_mix
@@ -45,6 +46,18 @@ def shards(tmp_path_factory):
 @pytest.fixture(scope="module")
 def run():
     return load_config(ROOT / "configs" / "tiny.yaml", TrainingRun)
+
+
+@pytest.mark.quickly
+@pytest.mark.parametrize("normals", [False, True])
+def test_a_picture_shows_what_was_seen_and_the_whole_beside_the_mesh(shards, run, normals):
+    decoder = dataclasses.replace(run.model.decoder, normals=normals)
+    prior = init_prior(dataclasses.replace(run.model, decoder=decoder), jax.random.key(0))
+    shapes = load_mix([shards], "val")[0]
+    drawn = held_out(prior, shapes, run.training, 2)
+    assert drawn.shape == (2 * PIXELS, 3 * PIXELS, 3)
+    inked = (drawn < 255).any(axis=-1).reshape(2, PIXELS, 3, PIXELS).sum(axis=(1, 3))
+    assert (inked[:, 2] > inked[:, 0]).all() and (inked[:, 0] > 0).all()
 
 
 def test_sdf_loss_weighs_near_surface_errors_fully_and_others_by_half():

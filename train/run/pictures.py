@@ -11,7 +11,8 @@ from jaxtyping import Float, UInt8
 
 from more2_jax.config import MeshingConfig
 from more2_jax.meshing.extract import extract_mesh
-from more2_jax.network.prior import Prior, encode_ordered
+from more2_jax.network.embedding_batch import embed
+from more2_jax.network.prior import Prior
 from more2_jax.types import Mesh
 from train.run.settings import TrainingConfig
 from train.shards.sampling import sample_batch
@@ -34,13 +35,12 @@ def held_out(prior: Prior, shapes: Shapes, config: TrainingConfig, count: int) -
     index = jnp.asarray(np.linspace(0, len(shapes.views) - 1, min(count, len(shapes.views))).astype(int))
     clean = dataclasses.replace(config, max_views=3, augment_probability=0.0, normals_unknown_probability=0.0)
     sample = sample_batch(jax.random.key(2), shapes, index, clean, prior.config.encoder.points)
-    embeddings = jax.jit(jax.vmap(lambda p, m, n: encode_ordered(prior, p, m, n)))(
-        sample.points[:, 0], sample.mask[:, 0], sample.normals[:, 0]
-    )
+    views = [np.asarray(x[:, 0]) for x in (sample.points, sample.normals, sample.mask)]
+    clouds, normals = ([x[i][m] for i, m in enumerate(views[2])] for x in views[:2])
+    embeddings = embed(prior, clouds, normals if prior.config.decoder.normals else None)
     rows = []
-    for i, shape in enumerate(index):
-        seen = np.asarray(sample.points[i, 0])[np.asarray(sample.mask[i, 0])]
-        mesh = extract_mesh(prior, jax.tree.map(lambda x, i=i: x[i], embeddings), MESHING)
+    for shape, seen, embedding in zip(index, clouds, embeddings, strict=True):
+        mesh = extract_mesh(prior, embedding, MESHING)
         whole = np.asarray(shapes.views[shape], np.float64).reshape(-1, 3)
         rows.append(np.hstack([splat(seen, None, 2), _surface(mesh), splat(whole, None, 1)]))
     return np.vstack(rows)
