@@ -7,8 +7,7 @@ be, proposes how a mask may fall in two; surfaces decide, as they decide who is 
 from __future__ import annotations
 
 import dataclasses
-import itertools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,47 +18,23 @@ from more2_jax.config import EvidenceMatcher, SceneConfig
 from more2_jax.geometry.normalized_cut import Cut, Rows, thinnest_cuts
 from more2_jax.geometry.poses import Points, Pose, apply_pose
 from more2_jax.geometry.transform import transform
-from more2_jax.matching.candidates import align_candidates, evidence_at, odds_of
+from more2_jax.matching.candidates import AlignedPairs, align_candidates, evidence_at, odds_of
 from more2_jax.matching.color import color_of
 from more2_jax.network.embedding_batch import embed
 from more2_jax.network.prior import Prior
+from more2_jax.tracking.divisions import Division, Part, Wholes, chosen
 from more2_jax.tracking.identify import Found, Identified
 from more2_jax.tracking.objects import place_of
 from more2_jax.tracking.split_masks import reach_m
 from more2_jax.types import Embedding, Instance, ObservedObject, Repair, SceneObject
 
 Normals = Float[np.ndarray, "n 3"]
-Weigh = Callable[[Sequence["Part"], Sequence[int]], Float[np.ndarray, "k p"]]
 
 # Chosen on rooms of regime `real`, docs/relocalization.md.
 LEAST_PART = 0.1  # share of a mask's points that either half must have
 CUTS = 2  # of a graph, that are tried
 NEIGHBORS = 7  # of a point, itself among them, that say whether it lies beside a thing
-SAME_SIZE = 0.8  # |log| of the ratio of the F_s: a half that differs more from every object is not compared
 CANDIDATES = 3  # partners of every half that are aligned
-# Log odds that the halves must have beyond the whole, for most masks hold one object: where the halves hardly touch,
-LEAST_GAIN_NARROW = 2.2
-LEAST_GAIN = 4.0  # and elsewhere, where both must be known
-SURE = 4.5  # log odds of a whole that is not divided
-
-
-@dataclass(frozen=True, kw_only=True)
-class Part:
-    """One half of a cloud, as a mask of its own would show it; in the cloud's frame."""
-
-    whole: int  # row of the cloud
-    rows: Rows  # its points
-    embedding: Embedding
-    narrow: bool  # whether the halves hardly touch
-
-
-@dataclass(frozen=True, kw_only=True)
-class Division:
-    """A cloud that is two objects, and which of the other scan's each half is; log odds beyond those of the whole."""
-
-    parts: tuple[Part, Part]  # the larger first
-    others: tuple[int | None, int | None]  # None: none of those that are left
-    gain: float
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,9 +73,17 @@ def divide_merged(
     """
     if not isinstance(config.matching, EvidenceMatcher) or identified.aligned is None:
         return None
-    compare = Compare(prior=prior, old=old, new=new, identified=identified, config=config)
-    of_instances = compare.divisions_of_instances(whole.instances)
-    of_objects = compare.divisions_of_objects(whole.objects)
+    compared = Compared(
+        prior=prior,
+        old=old,
+        new=new,
+        identified=identified,
+        aligned=identified.aligned,
+        matcher=config.matching,
+        config=config,
+    )
+    of_instances = compared.divisions_of_instances(whole.instances)
+    of_objects = compared.divisions_of_objects(whole.objects)
     if not of_instances and not of_objects:
         return None
     return with_instances_divided(with_objects_divided(whole, of_objects, first_number), of_instances)
@@ -133,83 +116,79 @@ def with_instances_divided(whole: Divided, divisions: Sequence[Division]) -> Div
 
 
 @dataclass(frozen=True, kw_only=True)
-class Compare:
+class Compared:
     """Two scans as they were compared: what a half of one may be in the other."""
 
     prior: Prior
     old: Sequence[ObservedObject]
     new: Sequence[ObservedObject]
     identified: Identified
+    aligned: AlignedPairs
+    matcher: EvidenceMatcher
     config: SceneConfig
 
     def divisions_of_instances(self, instances: Sequence[Instance]) -> list[Division]:
         """Which instances hold two objects that are known apart."""
         partner = {f.instance: f.object for f in self.identified.found}
-        missing = sorted(set(range(len(self.old))) - set(partner.values()))
-        now = self.odds_now().T
+        wholes = wholes_of(partner, self.old, self.odds().T)
         cuts = {
             i: self.cuts(
-                instances[i].points, partner.get(i), lambda k, i=i: self.placed(k, i, object_moves=True)
+                self.new[i].points,
+                apply_pose(np.linalg.inv(self.best_pose(partner[i], i)), self.old[partner[i]].points)
+                if i in partner
+                else None,
             )
             for i in range(len(instances))
-            if missing and (now[i, partner[i]] < SURE if i in partner else len(missing) > 1)
+            if wholes.in_doubt(i)
         }
 
-        def weigh(parts: Sequence[Part], others: Sequence[int]) -> Float[np.ndarray, "k p"]:
-            halves = [
-                ObservedObject(
-                    points=half.points,
-                    embedding=p.embedding,
-                    color=color_of(half.colors),
-                    sight=self.new[p.whole].sight,
-                )
-                for p in parts
-                for half in (part_of_instance(instances[p.whole], p),)
-            ]
-            return self.odds([self.old[k] for k in others], halves)
+        def half(p: Part) -> ObservedObject:
+            i = part_of_instance(instances[p.whole], p)
+            return ObservedObject(
+                points=i.points,
+                embedding=p.embedding,
+                color=color_of(i.colors),
+                sight=self.new[p.whole].sight,
+            )
 
-        parts = self.halves(cuts, [(i.points, i.normals) for i in instances])
-        scale = [float(o.embedding.scale) for o in self.old]
-        return chosen(parts, partner, missing, scale, now, weigh)
+        return chosen(
+            self.halves(cuts, [(i.points, i.normals) for i in instances]),
+            wholes,
+            lambda parts, others: self.odds_of_halves([self.old[k] for k in others], map(half, parts)),
+        )
 
     def divisions_of_objects(self, objects: Sequence[SceneObject]) -> list[Division]:
         """Which objects, seen once, are two that the new scan shows apart."""
         partner = {f.object: f.instance for f in self.identified.found}
-        left = sorted(set(range(len(self.new))) - set(partner.values()))
-        now = self.odds_now()
-        once = [k for k, o in enumerate(objects) if len(o.observations) == 1]
+        wholes = wholes_of(partner, self.new, self.odds())
         cuts = {
             k: self.cuts(
-                self.old[k].points, partner.get(k), lambda i, k=k: self.placed(k, i, object_moves=False)
+                self.old[k].points,
+                apply_pose(self.best_pose(k, partner[k]), self.new[partner[k]].points)
+                if k in partner
+                else None,
             )
-            for k in once
-            if left and (now[k, partner[k]] < SURE if k in partner else len(left) > 1)
+            for k, o in enumerate(objects)
+            if len(o.observations) == 1 and wholes.in_doubt(k)
         }
 
-        def weigh(parts: Sequence[Part], others: Sequence[int]) -> Float[np.ndarray, "k p"]:
-            halves = [
-                transform(
-                    ObservedObject(points=o.points[p.rows], embedding=p.embedding, color=None),
-                    place_of(o.observations[-1]),
-                )
-                for p in parts
-                for o in (objects[p.whole],)
-            ]
-            halves = [
-                dataclasses.replace(h, sight=self.old[p.whole].sight)
-                for h, p in zip(halves, parts, strict=True)
-            ]
-            return self.odds(halves, [self.new[i] for i in others]).T
+        def half(p: Part) -> ObservedObject:
+            o = objects[p.whole]
+            part = ObservedObject(points=o.points[p.rows], embedding=p.embedding, color=None)
+            placed = transform(part, place_of(o.observations[-1]))
+            return dataclasses.replace(placed, sight=self.old[p.whole].sight)
 
-        parts = self.halves(cuts, [(o.points, None) for o in objects])
-        scale = [float(o.embedding.scale) for o in self.new]
-        return chosen(parts, partner, left, scale, now, weigh)
+        return chosen(
+            self.halves(cuts, [(o.points, None) for o in objects]),
+            wholes,
+            lambda parts, others: self.odds_of_halves(map(half, parts), [self.new[i] for i in others]).T,
+        )
 
-    def cuts(self, points: Points, partner: int | None, placed: Callable[[int], Points]) -> list[Cut]:
+    def cuts(self, points: Points, partner: Points | None) -> list[Cut]:
         """How a cloud may fall in two: beside what it was found to be, and where it is thinnest."""
         first: list[Cut] = []
         if partner is not None:
-            rest = beside_of(placed(partner), points)
+            rest = beside_of(partner, points)
             if rest.mean() < LEAST_PART:
                 return []
             first = [(rest, False)]
@@ -219,38 +198,28 @@ class Compare:
         fewest = max(self.config.min_points, LEAST_PART * len(points))
         return [c for c in cuts if min(c[0].sum(), (~c[0]).sum()) >= fewest]
 
-    def placed(self, k: int, i: int, *, object_moves: bool) -> Points:
-        """Object `k` in the new scan's frame, or instance `i` in the scene's, by the best pose found of the pair."""
-        T = self.best_pose(k, i)
-        if object_moves:
-            return apply_pose(np.linalg.inv(T), self.old[k].points)
-        return apply_pose(T, self.new[i].points)
-
     def best_pose(self, k: int, i: int) -> Pose:
         """The pose of a pair that fits best: T_scene_scan as if the object had not moved."""
-        aligned, config = self.identified.aligned, self.config
-        assert aligned is not None and isinstance(config.matching, EvidenceMatcher)
-        row = aligned.row_of(k, i)
-        best = evidence_at(aligned, config.matching.search, config.motion, self.height_m()).pose
-        return aligned.T_old_new[row, best[row]]
+        row = self.aligned.row_of(k, i)
+        best = evidence_at(self.aligned, self.matcher.search, self.config.motion, self.height_m()).pose
+        return self.aligned.T_old_new[row, best[row]]
 
     def height_m(self) -> float:
         """The common height, upright."""
         return float(self.identified.frame.T_scene_scan[2, 3]) if self.config.motion == "upright" else 0.0
 
-    def odds_now(self) -> Float[np.ndarray, "n m"]:
-        """Of the wholes."""
-        aligned, config = self.identified.aligned, self.config
-        assert aligned is not None and isinstance(config.matching, EvidenceMatcher)
-        return odds_of(aligned, config.matching.search, config.motion, self.height_m())
+    def odds(self) -> Float[np.ndarray, "n m"]:
+        """Log odds of the wholes."""
+        return odds_of(self.aligned, self.matcher.search, self.config.motion, self.height_m())
 
-    def odds(self, old: Sequence[ObservedObject], new: Sequence[ObservedObject]) -> Float[np.ndarray, "n m"]:
-        """Of halves with what they may be."""
-        config, T = self.config, self.identified.frame.T_scene_scan
-        assert isinstance(config.matching, EvidenceMatcher)
-        matcher = dataclasses.replace(config.matching, candidates=CANDIDATES)
-        aligned = align_candidates(self.prior, old, new, matcher, config.motion, T)
-        return odds_of(aligned, matcher.search, config.motion, self.height_m())
+    def odds_of_halves(
+        self, old: Iterable[ObservedObject], new: Iterable[ObservedObject]
+    ) -> Float[np.ndarray, "n m"]:
+        """Log odds of halves with what they may be."""
+        matcher = dataclasses.replace(self.matcher, candidates=CANDIDATES)
+        T = self.identified.frame.T_scene_scan
+        aligned = align_candidates(self.prior, list(old), list(new), matcher, self.config.motion, T)
+        return odds_of(aligned, matcher.search, self.config.motion, self.height_m())
 
     def halves(
         self, cuts: dict[int, list[Cut]], clouds: Sequence[tuple[Points, Normals | None]]
@@ -272,58 +241,12 @@ class Compare:
         return list(zip(parts[::2], parts[1::2], strict=True))
 
 
-def chosen(
-    halves: Sequence[tuple[Part, Part]],
-    partner: dict[int, int],
-    left: Sequence[int],
-    scale: Sequence[float],
-    odds_now: Float[np.ndarray, "w k"],
-    weigh: Weigh,
-) -> list[Division]:
-    """The divisions that surfaces find likelier than the wholes; each cloud once, each of the other scan's once.
-
-    `partner`: what a whole was found to be; `left`: rows of the other scan's clouds that nothing was found to be;
-    `scale`: F_s of the other scan's clouds.
-    """
-
-    def may_be(part: Part) -> list[int]:
-        rows = [*left, *([partner[part.whole]] if part.whole in partner else [])]
-        ratio = np.log(float(part.embedding.scale) / np.array([scale[k] for k in rows]))
-        return [k for k, r in zip(rows, ratio, strict=True) if abs(r) < SAME_SIZE]
-
-    halves = [pair for pair in halves if any(may_be(p) for p in pair)]
-    if not halves:
-        return []
-    others = sorted({k for pair in halves for p in pair for k in may_be(p)})
-    odds = weigh([p for pair in halves for p in pair], others)
-    at = {k: n for n, k in enumerate(others)}
-    proposals = []
-    for n, pair in enumerate(halves):
-        whole = pair[0].whole
-        now = max(odds_now[whole, partner[whole]], 0.0) if whole in partner else 0.0
-        fits = [
-            {None: 0.0} | {k: odds[at[k], 2 * n + side] for k in may_be(p) if odds[at[k], 2 * n + side] > 0}
-            for side, p in enumerate(pair)
-        ]
-        for k, q in itertools.product(*fits):
-            gain = float(fits[0][k] + fits[1][q] - now)
-            both = k is not None and q is not None
-            enough = gain > LEAST_GAIN_NARROW if pair[0].narrow else both and gain > LEAST_GAIN
-            if enough and k != q:
-                proposals.append(Division(parts=pair, others=(k, q), gain=gain))
-    return compatible(proposals)
-
-
-def compatible(proposals: Sequence[Division]) -> list[Division]:
-    """The best proposals that share no cloud."""
-    kept: list[Division] = []
-    for d in sorted(proposals, key=lambda d: -d.gain):
-        clash = any(
-            d.parts[0].whole == e.parts[0].whole or (set(d.others) & set(e.others)) - {None} for e in kept
-        )
-        if not clash:
-            kept.append(d)
-    return kept
+def wholes_of(
+    partner: Mapping[int, int], others: Sequence[ObservedObject], odds: Float[np.ndarray, "w k"]
+) -> Wholes:
+    """How the clouds of one scan stand to `others`, those of the other."""
+    left = sorted(set(range(len(others))) - set(partner.values()))
+    return Wholes(partner=partner, left=left, scale=[float(o.embedding.scale) for o in others], odds=odds)
 
 
 def beside_of(whole: Points, points: Points) -> Rows:

@@ -4,14 +4,8 @@ import numpy as np
 import pytest
 from boxes import box, two_boxes
 
-from more2_jax.tracking.merged_masks import (
-    Division,
-    Part,
-    beside_of,
-    chosen,
-    compatible,
-    larger_first,
-)
+from more2_jax.tracking.divisions import Division, Part, Wholes, chosen, compatible
+from more2_jax.tracking.merged_masks import beside_of, larger_first
 from more2_jax.types import Embedding
 
 
@@ -44,10 +38,27 @@ def decided(odds, *, partner=None, now=0.0, narrow=False, scale=(1.0, 1.0, 1.0))
     """What becomes of one mask whose halves have `odds` (others, 2)."""
     odds = np.asarray(odds, float)
     partner = {} if partner is None else {0: partner}
-    left = [k for k in range(len(odds)) if k not in partner.values()]
-    before = np.full((1, len(odds)), now)
-    halves = [pair(narrow=narrow)]
-    return chosen(halves, partner, left, scale[: len(odds)], before, lambda _, others: odds[others])
+    wholes = Wholes(
+        partner=partner,
+        left=[k for k in range(len(odds)) if k not in partner.values()],
+        scale=scale[: len(odds)],
+        odds=np.full((1, len(odds)), now),
+    )
+    return chosen([pair(narrow=narrow)], wholes, lambda _, others: odds[others])
+
+
+@pytest.mark.parametrize(
+    ("partner", "left", "now", "doubt"),
+    [(None, 1, 0.0, False), (None, 2, 0.0, True), (0, 1, 4.0, True), (0, 1, 5.0, False), (0, 0, 0.0, False)],
+)
+def test_only_a_mask_whose_halves_could_be_what_is_missing_is_cut(partner, left, now, doubt):
+    wholes = Wholes(
+        partner={} if partner is None else {0: partner},
+        left=range(1, 1 + left),
+        scale=[1.0] * 3,
+        odds=np.full((1, 3), now),
+    )
+    assert wholes.in_doubt(0) == doubt
 
 
 def test_halves_that_are_two_known_things_are_two():
