@@ -1,0 +1,121 @@
+"""Which clouds are two things: divisions that make more sense of the other scan than the wholes do.
+
+The decision alone, from log odds that surfaces give (`merged_masks`).
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from more2_jax.geometry.normalized_cut import Rows
+from more2_jax.types import Embedding
+
+# Chosen on rooms of regime `real`, docs/relocalization.md.
+SAME_SIZE = 0.8  # |log| of the ratio of the F_s: a half that differs more from every object is not compared
+# Log odds that the halves must have beyond the whole, for most masks hold one object: where the halves hardly touch,
+LEAST_GAIN_NARROW = 2.2
+LEAST_GAIN = 4.0  # and elsewhere, where both must be known
+SURE = 4.5  # log odds of a whole that is not divided
+
+
+@dataclass(frozen=True, kw_only=True)
+class Part:
+    """One half of a cloud, as a mask of its own would show it; in the cloud's frame."""
+
+    whole: int  # row of the cloud
+    rows: Rows  # its points
+    embedding: Embedding
+    narrow: bool  # whether the halves hardly touch
+
+
+@dataclass(frozen=True, kw_only=True)
+class Division:
+    """A cloud that is two objects, and which of the other scan's each half is; log odds beyond those of the whole."""
+
+    parts: tuple[Part, Part]  # the larger first
+    others: tuple[int | None, int | None]  # None: none of those that are left
+    gain: float
+
+
+# Log odds (others, parts) of every part with those of the other scan's clouds that are named.
+Weigh = Callable[[Sequence[Part], Sequence[int]], Float[np.ndarray, "k p"]]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Wholes:
+    """How the clouds of one scan stand to those of the other, before any is divided."""
+
+    partner: Mapping[int, int]  # what a cloud was found to be
+    left: Sequence[int]  # rows of the other scan's clouds that nothing was found to be
+    scale: Sequence[float]  # F_s of the other scan's clouds
+    odds: Float[np.ndarray, "w k"]  # log odds of every cloud with every other
+
+    def in_doubt(self, whole: int) -> bool:
+        """Whether a division of the cloud could say what those left are."""
+        if whole in self.partner:
+            return len(self.left) > 0 and bool(self.odds[whole, self.partner[whole]] < SURE)
+        return len(self.left) > 1
+
+    def may_be(self, part: Part) -> list[int]:
+        """Those of the other scan that a half may be: left or its whole's, of about its size."""
+        rows = [*self.left, *([self.partner[part.whole]] if part.whole in self.partner else [])]
+        ratio = np.log(float(part.embedding.scale) / np.array([self.scale[k] for k in rows]))
+        return [k for k, r in zip(rows, ratio, strict=True) if abs(r) < SAME_SIZE]
+
+    def gained(self, whole: int) -> float:
+        """Log odds that are lost with the whole."""
+        return max(float(self.odds[whole, self.partner[whole]]), 0.0) if whole in self.partner else 0.0
+
+
+def chosen(halves: Sequence[tuple[Part, Part]], wholes: Wholes, weigh: Weigh) -> list[Division]:
+    """The divisions that are likelier than the wholes; each cloud once, each of the other scan's once."""
+    halves = [pair for pair in halves if any(wholes.may_be(p) for p in pair)]
+    if not halves:
+        return []
+    others = sorted({k for pair in halves for p in pair for k in wholes.may_be(p)})
+    odds = weigh([p for pair in halves for p in pair], others)
+    row = {k: n for n, k in enumerate(others)}
+    return compatible(
+        [
+            division
+            for n, pair in enumerate(halves)
+            for division in proposals(
+                pair,
+                [
+                    {k: float(odds[row[k], 2 * n + side]) for k in wholes.may_be(p)}
+                    for side, p in enumerate(pair)
+                ],
+                wholes.gained(pair[0].whole),
+            )
+        ]
+    )
+
+
+def proposals(pair: tuple[Part, Part], odds: Sequence[Mapping[int, float]], gained: float) -> list[Division]:
+    """What two halves may be, where that gains enough. `odds`: of each with what it may be."""
+    fits = [{None: 0.0} | {k: o for k, o in of_half.items() if o > 0} for of_half in odds]
+    found = []
+    for first, second in itertools.product(*fits):
+        gain = fits[0][first] + fits[1][second] - gained
+        both = first is not None and second is not None
+        enough = gain > LEAST_GAIN_NARROW if pair[0].narrow else both and gain > LEAST_GAIN
+        if enough and first != second:
+            found.append(Division(parts=pair, others=(first, second), gain=gain))
+    return found
+
+
+def compatible(proposals: Sequence[Division]) -> list[Division]:
+    """The best proposals that share no cloud."""
+    kept: list[Division] = []
+    for d in sorted(proposals, key=lambda d: -d.gain):
+        clash = any(
+            d.parts[0].whole == e.parts[0].whole or (set(d.others) & set(e.others)) - {None} for e in kept
+        )
+        if not clash:
+            kept.append(d)
+    return kept
