@@ -251,6 +251,8 @@ class AccumulatedObject:
     observation: Integer[np.ndarray, " n"]  # that each point is of, 0 to k − 1
     poses: Float[np.ndarray, "k 4 4"]  # T_ref_scan; the first observation is held where others are moved
     embedding: Embedding  # NumPy leaves, unbatched; of all points together
+    # Unit, outward, in the object's frame; zeros where a point's is not known. None: nowhere.
+    normals: Float[np.ndarray, "n 3"] | None = None
     # Of each observation, where its scan's sensors stood, in that scan's frame; (0, 3) where not known.
     sensors: tuple[Float[np.ndarray, "_ 3"], ...]
     # What was no object in the scan that saw it first, in the object's frame: its floor is that of this room.
@@ -334,6 +336,8 @@ class SceneObject:
     points: Float[np.ndarray, "n 3"]  # float64
     point_scan: Integer[np.ndarray, "n"]
     embedding: Embedding  # NumPy leaves, unbatched; frame of the reference observation
+    # Of `points`: unit, outward; zeros where not known. None: nowhere.
+    normals: Float[np.ndarray, "n 3"] | None = None
     mesh: Mesh | None = None
     color: Color | None = None  # of the accumulated observations whose scans have colors
 

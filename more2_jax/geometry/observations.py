@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from more2_jax.geometry.free_space import spread
-from more2_jax.geometry.poses import Points, Pose, apply_pose
+from more2_jax.geometry.poses import Points, Pose, apply_pose, turned
 from more2_jax.types import AccumulatedObject
 
 
@@ -18,12 +18,21 @@ def own_points(o: AccumulatedObject, row: int) -> Points:
     return apply_pose(np.linalg.inv(o.poses[row]), o.points[o.observation == row])
 
 
+def own_normals(o: AccumulatedObject, row: int) -> Points | None:
+    """The normals of those points, in its scan's frame; zeros where not known, None where the object has none."""
+    if o.normals is None:
+        return None
+    return turned(np.linalg.inv(o.poses[row]), o.normals[o.observation == row])
+
+
 def with_poses(o: AccumulatedObject, poses: Sequence[Pose]) -> AccumulatedObject:
-    """The object with other poses of its observations, one each; its points follow, its embedding does not."""
-    points = o.points.copy()
+    """The object with other poses of its observations, one each; points and normals follow, the embedding does not."""
+    points, normals = o.points.copy(), None if o.normals is None else o.normals.copy()
     for row, T in enumerate(poses):
         points[o.observation == row] = apply_pose(T, own_points(o, row))
-    return dataclasses.replace(o, points=points, poses=np.stack(poses))
+        if normals is not None:
+            normals[o.observation == row] = turned(T, own_normals(o, row))
+    return dataclasses.replace(o, points=points, normals=normals, poses=np.stack(poses))
 
 
 def seen_from(o: AccumulatedObject) -> Float[np.ndarray, "n s 3"] | None:

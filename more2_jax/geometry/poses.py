@@ -22,6 +22,11 @@ def apply_pose(T_a_b: Pose, points: Points) -> Points:
     return points @ T_a_b[:3, :3].T + T_a_b[:3, 3]
 
 
+def turned(T_a_b: Pose, normals: Points | None) -> Points | None:
+    """Directions from frame b in frame a; None stays None."""
+    return None if normals is None else normals @ T_a_b[:3, :3].T
+
+
 def vertical_shift(height_m: float) -> Pose:
     """A shift along z, meters."""
     T = np.eye(4)

@@ -49,18 +49,19 @@ def extract_mesh(
     seen: Float[np.ndarray, "n 3"] | None = None,
     floor: float | None = None,
     seen_from: Float[np.ndarray, "n s 3"] | None = None,
+    normals: Float[np.ndarray, "n 3"] | None = None,
 ) -> Mesh | None:
     """A level set of one object's field, by default 0; meters in its scan's frame, always closed (paper §3.4).
 
     `half_width` (canonical units) is half the edge of the query box. With `seen`, points of the surface in the
     scan's frame, and a `config.mls_bandwidth`, the surface runs through them; each was seen from one of the sensor
-    positions `seen_from` (NaN fills up), if they are known. Nothing lies below the height `floor`. Returns None
-    when the field stays above `level` in the box: there is no surface to show. Raises ValueError unless
-    `resolution` is `coarse_resolution` doubled some times.
+    positions `seen_from` (NaN fills up), if they are known, and faces along `normals` (zeros where not known). Nothing
+    lies below the height `floor`. Returns None when the field stays above `level` in the box: there is no surface to
+    show. Raises ValueError unless `resolution` is `coarse_resolution` doubled some times.
     """
     _check(config)
     lowest = lowest_height(embedding, floor)
-    surface = observed_surface(prior, embedding, seen, config, lowest, seen_from)
+    surface = observed_surface(prior, embedding, seen, config, lowest, seen_from, normals)
     field = partial(_field, prior, embedding, level)
     values = partial(_corrected, surface, lowest)
     found = _sampled(field, values, cube(config.coarse_resolution, half_width))
@@ -88,6 +89,7 @@ def observed_surface(
     config: MeshingConfig,
     lowest: float = -np.inf,
     sensors: Float[np.ndarray, "n s 3"] | None = None,
+    normals: Float[np.ndarray, "n 3"] | None = None,
 ) -> ObservedSurface | None:
     """Oriented planes around observed points (scan's frame). None if there are none, or the settings ask for none."""
     if observed is None or not config.mls_bandwidth:
@@ -96,7 +98,8 @@ def observed_surface(
     eyes = None if sensors is None else canonical(embedding, uniform_subsample(sensors))
     asked = uniform_subsample(points, SAMPLES)
     gradient = _in_chunks(_field_gradients, prior, embedding, asked)[KDTree(asked).query(points)[1]]
-    return fit_observed_surface(points, gradient, config.mls_bandwidth, lowest, eyes)
+    sides = None if normals is None else uniform_subsample(normals)
+    return fit_observed_surface(points, gradient, config.mls_bandwidth, lowest, eyes, sides)
 
 
 def canonical(embedding: Embedding, points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:

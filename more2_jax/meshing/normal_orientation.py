@@ -1,9 +1,10 @@
-"""Consistent orientation of normals: by the sensors' positions, the free way along them, the field, the neighbors.
+"""Consistent orientation of normals: by sensors and the scan's own normals, free ways, the field, the neighbors.
 
-A surface faces the sensor that saw it. Where sensors are not known, points alone do not tell: along the normal, matter
-ends sooner than free space does, a board's other face is nearer than the next shelf. Where nothing lies on either
-side, the field's gradient decides. These votes are then made to agree over a signed graph of neighbors (after Hoppe et
-al., "Surface reconstruction from unorganized points", 1992; one sparse linear system instead of a spanning tree).
+A surface faces the sensor that saw it, and a scan's normals say so. Where neither is known, points alone do not tell:
+along the normal, matter ends sooner than free space does, a board's other face is nearer than the next shelf. Where
+nothing lies on either side, the field's gradient decides. These votes are then made to agree over a signed graph of
+neighbors (after Hoppe et al., "Surface reconstruction from unorganized points", 1992; one sparse linear system instead
+of a spanning tree).
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ CONE_SLOPE = 0.45  # a point this share of the distance off a ray counts as hit
 LINE_OF_SIGHT_SLOPE = 0.25  # and where the ray goes to a sensor
 FIELD_WEIGHT = 0.3  # of the field's gradient, against 1 of the ratio of free distances
 GEOMETRY_WEIGHT = 0.25  # of both, where sensors are known, against 1 of a sensor
-GRAZING_COSINE = 0.2  # from here on a sensor sees a side for sure
+GRAZING_COSINE = 0.2  # from here on a sensor, or a scan's normal, tells a side for sure
 MAX_VOTERS = 4096  # points that cast rays; the others follow them. 1,024 turn up to 6 % of a noisy cloud's (there, too)
 GRAPH_NEIGHBORS = 10
 VOTE_WEIGHT = 0.05  # of a point's own vote, against the sum of its neighbors'
@@ -43,25 +44,30 @@ def outward_signs(
     lowest: float,
     sensors: Float[np.ndarray, "n s 3"] | None = None,
     known: Neighbors | None = None,
+    given: Points | None = None,
 ) -> Values:
     """+1 where a point's normal goes outward, −1 where inward.
 
     `tree` holds the points (canonical units); `slope` is by how much the field rises along the normal, −1 to 1; rays
     are tested from `min_distance` on; below the height `lowest` there is no free space. One of the positions `sensors`,
     if they are known, saw the point; NaN fills up. `known`: the points' neighbors, if they were searched before.
+    `given`: the normals that the scan has, outward; zeros where it has none.
     """
     points, voters = np.asarray(tree.data), np.arange(0, tree.n, -(-tree.n // MAX_VOTERS))
-    by_sensor = np.zeros(len(voters))
+    by_view = np.zeros(len(voters))
     if sensors is not None:
-        by_sensor = sensor_votes(tree, points[voters], normal[voters], sensors[voters], min_distance)
-    unsure = voters[np.abs(by_sensor) < 1]
+        by_view = sensor_votes(tree, points[voters], normal[voters], sensors[voters], min_distance)
+    if given is not None:
+        along = np.einsum("ni,ni->n", given[voters], normal[voters])
+        by_view = np.clip(by_view + np.clip(along / GRAZING_COSINE, -1, 1), -1, 1)
+    unsure = voters[np.abs(by_view) < 1]
     free = [
         free_distance(tree, points[unsure], sign * normal[unsure], min_distance, lowest) for sign in (1, -1)
     ]
     vote = FIELD_WEIGHT * np.clip(slope, -1, 1)
     vote[unsure] += np.clip(np.log(free[0] / free[1]), -1, 1)
-    vote *= 1.0 if sensors is None else GEOMETRY_WEIGHT
-    vote[voters] += by_sensor
+    vote *= 1.0 if sensors is None and given is None else GEOMETRY_WEIGHT
+    vote[voters] += by_view
     matrix, right = signed_graph(points, normal, vote, known or nearest_neighbors(tree))
     return np.where(conjugate_gradients(matrix, right, vote) < 0, -1.0, 1.0)
 

@@ -45,12 +45,12 @@ def object_mesh(prior: Prior, o: AccumulatedObject, config: SceneConfig) -> Mesh
     "observed": seen points lie on the surface, so the field's median there is its bias, and is taken off.
     """
     meshing = config.meshing
-    points, sensors = inlier_points(o, config)
+    points, sensors, normals = inlier_points(o, config)
     level = observed_level(prior, o.embedding, points) if meshing.level == "observed" else 0.0
     if not in_several_scans(o):
         meshing = dataclasses.replace(meshing, screening_length_multi_scan=0.0)
     half_width, floor = box_half_width(o), object_floor(o, config)
-    return extract_mesh(prior, o.embedding, meshing, half_width, level, points, floor, sensors)
+    return extract_mesh(prior, o.embedding, meshing, half_width, level, points, floor, sensors, normals)
 
 
 def object_floor(o: AccumulatedObject, config: SceneConfig) -> float | None:
@@ -74,17 +74,18 @@ def in_several_scans(o: AccumulatedObject) -> bool:
 
 def inlier_points(
     o: AccumulatedObject, config: SceneConfig
-) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n s 3"] | None]:
-    """A uniform subsample of an object's points without outliers, in its frame; and the sensors that may see them.
+) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n s 3"] | None, Float[np.ndarray, "n 3"] | None]:
+    """A uniform subsample of an object's points without outliers, in its frame; the sensors that may see them; normals.
 
-    No sensors where they are not known, or not asked for.
+    No sensors and no normals where they are not known, or not asked for.
     """
     meshing = config.meshing
     points = uniform_subsample(o.points)
     sensors = seen_from(o) if meshing.mls_bandwidth else None
     factor = meshing.outlier_factor_multi_scan if in_several_scans(o) else meshing.outlier_factor
     kept = inliers(points, factor)
-    return points[kept], None if sensors is None else uniform_subsample(sensors)[kept]
+    sides = (sensors, o.normals if meshing.mls_bandwidth else None)
+    return points[kept], *(None if x is None else uniform_subsample(x)[kept] for x in sides)
 
 
 def box_half_width(o: AccumulatedObject) -> float:

@@ -113,12 +113,13 @@ def fit_observed_surface(
     bandwidth: float,
     lowest: float = -np.inf,
     sensors: Float[np.ndarray, "p s 3"] | None = None,
+    normals: Points | None = None,
 ) -> ObservedSurface | None:
     """Planes through each point's neighbors, oriented outward. None if there are too few points.
 
     `gradient` of the field at the points has a vote in what is outward; one of the positions `sensors` saw a point, if
-    they are known (NaN fills up). All in canonical units, relative to the object's center. Below the height `lowest`
-    there is no free space.
+    they are known (NaN fills up); the scan says that it faces along `normals` (zeros where it does not say). All in
+    canonical units, relative to the object's center. Below the height `lowest` there is no free space.
     """
     if len(points) < MIN_POINTS:
         return None
@@ -133,7 +134,7 @@ def fit_observed_surface(
     around = gradient[neighbors].sum(axis=1)
     slope = np.einsum("ni,ni->n", normal, around) / np.maximum(np.linalg.norm(around, axis=1), 1e-9)
     gap = GAP_SPACINGS * max(float(np.median(distance[:, 1])), MIN_GAP)
-    signs = outward_signs(tree, normal, slope, gap, lowest, sensors, (distance, neighbors))
+    signs = outward_signs(tree, normal, slope, gap, lowest, sensors, (distance, neighbors), normals)
     normal = signs[:, None] * normal
     area = surface_areas(points, normal, distance, neighbors)
     return ObservedSurface(tree, center, normal, area, neighbors, bandwidth, gap, residual, noiseless)

@@ -11,7 +11,7 @@ import jaxlie
 import numpy as np
 
 from more2_jax.config import SceneConfig
-from more2_jax.geometry.observations import own_points, with_poses
+from more2_jax.geometry.observations import own_normals, own_points, with_poses
 from more2_jax.geometry.padding import bucket
 from more2_jax.geometry.poses import local_poses, world_poses
 from more2_jax.network.embedding_batch import (
@@ -52,9 +52,17 @@ def padded_observations(
     most = bucket(max(len(o.poses) for o in objects), 2)
     together, _ = stack([o.embedding for o in objects])
     rows = [*objects, *[objects[0]] * (len(together.scale) - len(objects))]
-    clouds = [[own_points(o, j) for j in range(len(o.poses))] for o in rows]
+    clouds, normals = (
+        [[of(o, j) for j in range(len(o.poses))] for o in rows] for of in (own_points, own_normals)
+    )
     # The j-th observations of all objects are one batch: as large as a scan's instances, whose program encodes it.
-    batches = [padded([row[j] if j < len(row) else row[0] for row in clouds]) for j in range(most)]
+    batches = [
+        padded(
+            [row[j] if j < len(row) else row[0] for row in clouds],
+            normals=[row[j] if j < len(row) else row[0] for row in normals],
+        )
+        for j in range(most)
+    ]
     codes = [jax.device_get(encode(prior, batch)) for batch in batches]
     origins = np.stack([np.asarray(batch.origin) for batch in batches], axis=1)
     poses = np.tile([1.0, 0, 0, 0, 0, 0, 0], (len(rows), most, 1))

@@ -56,7 +56,7 @@ def refine_object_poses(
             result[n] = with_motions(objects[n], motions, max_turn_deg(surfaces[n]))
     if not (config.accumulate_target and result):
         return result
-    codes = embed(prior, [o.points for o in result])
+    codes = embed(prior, [o.points for o in result], [o.normals for o in result])
     return [dataclasses.replace(o, embedding=code) for o, code in zip(result, codes, strict=True)]
 
 
@@ -75,7 +75,8 @@ def observation_surfaces(
         own = uniform_subsample(np.flatnonzero(o.observation == k), SURFACE_POINTS)
         own = own[inliers(o.points[own], config.meshing.outlier_factor)]
         eyes = None if sensors is None else sensors[own]
-        yield observed_surface(prior, o.embedding, o.points[own], config.meshing, lowest, eyes)
+        sides = None if o.normals is None else o.normals[own]
+        yield observed_surface(prior, o.embedding, o.points[own], config.meshing, lowest, eyes, sides)
 
 
 def max_turn_deg(surfaces: Sequence[ObservedSurface | None]) -> float:

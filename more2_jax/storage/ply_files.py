@@ -11,6 +11,8 @@ from plyfile import PlyData, PlyElement
 from more2_jax.scans.files.ply_cloud import read_ply
 from more2_jax.types import Mesh
 
+NORMAL = ("nx", "ny", "nz")
+
 
 def _vertices(points: Float[np.ndarray, "n 3"], **properties: np.ndarray) -> PlyElement:
     columns = {axis: np.asarray(points, "<f8")[:, i] for i, axis in enumerate("xyz")} | properties
@@ -21,18 +23,33 @@ def _vertices(points: Float[np.ndarray, "n 3"], **properties: np.ndarray) -> Ply
 
 
 def write_points(
-    path: Path, points: Float[np.ndarray, "n 3"], scan: Int[np.ndarray, " n"], name: str = "scan"
+    path: Path,
+    points: Float[np.ndarray, "n 3"],
+    scan: Int[np.ndarray, " n"],
+    name: str = "scan",
+    normals: Float[np.ndarray, "n 3"] | None = None,
 ) -> None:
-    """Writes a cloud in meters; each point's integer goes into the vertex property `name`."""
-    PlyData([_vertices(points, **{name: np.asarray(scan, "<i4")})], byte_order="<").write(str(path))
+    """Writes a cloud in meters, with its normals if it has any; each point's integer is the vertex property `name`."""
+    columns = {name: np.asarray(scan, "<i4")}
+    if normals is not None:
+        columns |= {axis: np.asarray(normals, "<f8")[:, i] for i, axis in enumerate(NORMAL)}
+    PlyData([_vertices(points, **columns)], byte_order="<").write(str(path))
 
 
-def read_points(path: Path) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, " n"]]:
-    """Reads a cloud and the scan of each of its points. Raises ValueError if the file is damaged."""
+def read_points(
+    path: Path,
+) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, " n"], Float[np.ndarray, "n 3"] | None]:
+    """Reads a cloud, the scan of each of its points, and their normals as written, if there are any.
+
+    Raises ValueError if the file is damaged.
+    """
     cloud = read_ply(path)
     if "scan" not in cloud.integer_properties:
         raise ValueError(f"{path}: no integer vertex property scan")
-    return cloud.points, cloud.properties["scan"].astype(np.int64)
+    normals = None
+    if all(axis in cloud.properties for axis in NORMAL):
+        normals = np.stack([np.asarray(cloud.properties[axis], np.float64) for axis in NORMAL], axis=-1)
+    return cloud.points, cloud.properties["scan"].astype(np.int64), normals
 
 
 def write_mesh(path: Path, mesh: Mesh) -> None:

@@ -140,7 +140,7 @@ def _fill(folder: Path, scene: LivingScene, config: SceneConfig, log: str, page:
     text = json.dumps(scene_to_json(scene), indent=1, allow_nan=False)
     (folder / "scene.json").write_text(text + "\n", encoding="utf-8")
     for o in scene.objects:
-        write_points(folder / points_name(o), o.points, o.point_scan)
+        write_points(folder / points_name(o), o.points, o.point_scan, normals=o.normals)
         if o.mesh is not None:
             write_mesh(folder / mesh_name(o), o.mesh)
     _write_background(folder / "background.ply", scene.scans)
@@ -239,7 +239,7 @@ def _scene(folder: Path, content: dict[str, Any]) -> LivingScene:
 
 def _background(path: Path) -> tuple[np.ndarray, np.ndarray]:
     """The background's points and their scans; none where the scene has no such file."""
-    return read_points(path) if path.is_file() else (np.zeros((0, 3)), np.zeros(0, np.int64))
+    return read_points(path)[:2] if path.is_file() else (np.zeros((0, 3)), np.zeros(0, np.int64))
 
 
 def _stacked(embeddings: list[Embedding]) -> dict[str, np.ndarray]:
@@ -295,7 +295,7 @@ def _frame(content: dict[str, Any] | None) -> Frame:
 def _object(
     folder: Path, o: dict[str, Any], embedding: Embedding, frames: Mapping[int, Frame]
 ) -> SceneObject:
-    points, point_scan = read_points(folder / o["points"])
+    points, point_scan, normals = read_points(folder / o["points"])
     seen = [
         s | {"T_ref_scan": np.array(s["T_ref_scan"], np.float64), "frame": frames[s["scan"]]}
         for s in o["observations"]
@@ -308,6 +308,7 @@ def _object(
         points=points,
         point_scan=point_scan,
         embedding=embedding,
+        normals=normals,
         mesh=None if o["mesh"] is None else read_mesh(folder / o["mesh"]),
         color=_color(o.get("color")),
     )

@@ -10,7 +10,7 @@ import numpy as np
 from more2_jax.geometry.poses import apply_pose
 from more2_jax.network.embedding_batch import embed
 from more2_jax.network.prior import Prior
-from more2_jax.tracking.objects import accumulated, accumulated_points, reference_pose
+from more2_jax.tracking.objects import accumulated, accumulated_normals, accumulated_points, reference_pose
 from more2_jax.types import AccumulatedObject, ScanRecord, SceneObject
 
 
@@ -25,6 +25,7 @@ def accumulated_object(o: SceneObject, scans: Sequence[ScanRecord]) -> Accumulat
         observation=row[o.point_scan[kept]],
         poses=np.stack([s.T_ref_scan for s in seen]),
         embedding=o.embedding,
+        normals=accumulated_normals(o),
         sensors=tuple(scans[s.scan].sensors for s in seen),
         background=apply_pose(reference_pose(o), scans[o.reference_scan].background),
     )
@@ -50,12 +51,17 @@ def with_refined(
 def refined_object(o: SceneObject, refined: AccumulatedObject) -> SceneObject:
     """The record with what refinement made of it; observations in doubt, and their points, stay."""
     seen, poses = accumulated(o), iter(refined.poses)
-    points = o.points.copy()
-    points[np.isin(o.point_scan, [s.scan for s in seen])] = refined.points
+    rows = np.isin(o.point_scan, [s.scan for s in seen])
+    points, normals = o.points.copy(), None if o.normals is None else o.normals.copy()
+    points[rows] = refined.points
+    if normals is not None and refined.normals is not None:
+        normals[rows] = refined.normals
     observations = tuple(
         dataclasses.replace(s, T_ref_scan=next(poses)) if s.accumulated else s for s in o.observations
     )
-    return dataclasses.replace(o, points=points, observations=observations, embedding=refined.embedding)
+    return dataclasses.replace(
+        o, points=points, normals=normals, observations=observations, embedding=refined.embedding
+    )
 
 
 def embed_accumulated(
@@ -65,6 +71,7 @@ def embed_accumulated(
     result = list(objects)
     if chosen:
         clouds = [accumulated_points(objects[k]) for k in chosen]
-        for k, embedding in zip(chosen, embed(prior, clouds), strict=True):
+        normals = [accumulated_normals(objects[k]) for k in chosen]
+        for k, embedding in zip(chosen, embed(prior, clouds, normals), strict=True):
             result[k] = dataclasses.replace(objects[k], embedding=embedding)
     return result

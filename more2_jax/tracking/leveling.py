@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from more2_jax.geometry.gravity import gravity
-from more2_jax.geometry.poses import Points, Pose, apply_pose
+from more2_jax.geometry.poses import Points, Pose, apply_pose, turned
 from more2_jax.types import Frame, Instance, Observation, Scan, SceneObject
 
 LEAST_TILT_DEG = 0.5  # a smaller tilt is left alone: clean scans stay as they are
@@ -52,8 +52,9 @@ def leveled(scan: Scan, T_level_scan: Pose) -> Scan:
 
 def leveled_instance(i: Instance, T_level_scan: Pose) -> Instance:
     """One instance of a leveled scan."""
-    normals = None if i.normals is None else i.normals @ T_level_scan[:3, :3].T
-    return dataclasses.replace(i, points=apply_pose(T_level_scan, i.points), normals=normals)
+    return dataclasses.replace(
+        i, points=apply_pose(T_level_scan, i.points), normals=turned(T_level_scan, i.normals)
+    )
 
 
 def as_given(

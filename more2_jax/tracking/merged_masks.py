@@ -179,7 +179,7 @@ class Compared:
             return dataclasses.replace(placed, sight=self.old[p.whole].sight)
 
         return chosen(
-            self.halves(cuts, [(o.points, None) for o in objects]),
+            self.halves(cuts, [(o.points, o.normals) for o in objects]),
             wholes,
             lambda parts, others: self.odds_of_halves(map(half, parts), [self.new[i] for i in others]).T,
         )
@@ -276,6 +276,7 @@ def part_of_object(o: SceneObject, part: Part) -> SceneObject:
         o,
         points=o.points[part.rows],
         point_scan=o.point_scan[part.rows],
+        normals=None if o.normals is None else o.normals[part.rows],
         embedding=part.embedding,
         mesh=None,
     )

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from more2_jax.geometry.poses import Points, Pose, apply_pose, rotation_error_deg
+from more2_jax.geometry.poses import Points, Pose, apply_pose, rotation_error_deg, turned
 from more2_jax.matching.color import color_of, pooled
 from more2_jax.types import Embedding, Frame, Instance, Observation, ScanRecord, SceneObject
 
@@ -35,6 +35,7 @@ def new_object(
         points=instance.points,
         point_scan=np.full(len(instance.points), scan),
         embedding=embedding,
+        normals=instance.normals,
         color=color_of(instance.colors),
     )
 
@@ -66,9 +67,18 @@ def seen_again(o: SceneObject, instance: Instance, seen: Observation) -> SceneOb
         observations=(*o.observations, seen),
         points=np.concatenate([o.points, apply_pose(seen.T_ref_scan, instance.points)]),
         point_scan=np.concatenate([o.point_scan, np.full(len(instance.points), seen.scan)]),
+        normals=all_normals(o, instance, seen.T_ref_scan),
         mesh=None if seen.accumulated else o.mesh,
         color=pooled(o.color, color_of(instance.colors)) if seen.accumulated else o.color,
     )
+
+
+def all_normals(o: SceneObject, other: Instance | SceneObject, T_ref_other: Pose) -> Points | None:
+    """The normals of the object's points and of another cloud's, in the object's frame; zeros where not known."""
+    both = (o.points, o.normals), (other.points, turned(T_ref_other, other.normals))
+    if all(normals is None for _, normals in both):
+        return None
+    return np.concatenate([np.zeros_like(p) if normals is None else normals for p, normals in both])
 
 
 def accumulated(o: SceneObject) -> list[Observation]:
@@ -81,6 +91,13 @@ def accumulated_points(o: SceneObject) -> Points:
     if all(seen.accumulated for seen in o.observations):
         return o.points
     return o.points[np.isin(o.point_scan, [seen.scan for seen in accumulated(o)])]
+
+
+def accumulated_normals(o: SceneObject) -> Points | None:
+    """The normals of the accumulated points; zeros where not known, None where the object has none."""
+    if o.normals is None:
+        return None
+    return o.normals[np.isin(o.point_scan, [seen.scan for seen in accumulated(o)])]
 
 
 def points_of(o: SceneObject, seen: Observation) -> Points:

@@ -15,7 +15,7 @@ from scipy.spatial import KDTree
 
 from more2_jax.geometry.poses import Points, Pose, apply_pose
 from more2_jax.matching.color import pooled
-from more2_jax.tracking.objects import accumulated_points, place_of
+from more2_jax.tracking.objects import accumulated_points, all_normals, place_of
 from more2_jax.types import Instance, Observation, Repair, SceneObject
 
 Parts = dict[
@@ -172,6 +172,7 @@ def absorbed(whole: SceneObject, part: SceneObject) -> SceneObject:
         whole,
         points=np.concatenate([whole.points, apply_pose(T_whole_part, part.points)]),
         point_scan=np.concatenate([whole.point_scan, part.point_scan]),
+        normals=all_normals(whole, part, T_whole_part),
         color=pooled(whole.color, part.color),
         mesh=None,
     )

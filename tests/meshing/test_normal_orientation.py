@@ -69,6 +69,20 @@ def test_of_a_single_sheet_the_field_decides(side):
     assert (outward_signs(KDTree(points), normals, side * sign, GAP, -np.inf) == side * sign).all()
 
 
+@pytest.mark.parametrize("field", [0.0, -1.0])
+def test_a_sheet_faces_where_the_scan_says_though_some_normals_are_missing_or_wrong(field):
+    rng = np.random.default_rng(0)
+    points = np.column_stack([rng.uniform(-0.4, 0.4, (1500, 2)), np.zeros(1500)])
+    up = np.tile([0.0, 0.0, 1.0], (1500, 1))
+    normals, sign = flipped(up)
+    given = up * rng.choice([0.0, 1.0, -1.0], (1500, 1), p=[0.4, 0.5, 0.1])
+    args = KDTree(points), normals, field * sign, GAP, -np.inf
+    assert (outward_signs(*args, given=given) == sign).all()
+    assert (outward_signs(*args, given=-given) == -sign).all()
+    nothing = outward_signs(*args, given=np.zeros_like(up))
+    np.testing.assert_array_equal(nothing, outward_signs(*args))
+
+
 def test_below_the_floor_there_is_no_free_space():
     """A sheet just above the floor: what lies between them is the thing."""
     rng = np.random.default_rng(0)

@@ -45,6 +45,11 @@ def embedding(rng: np.random.Generator, origin: np.ndarray, channels: int = 4) -
     )
 
 
+def upward(count: int) -> np.ndarray:
+    """Normals, of which every third is not known."""
+    return np.where(np.arange(count)[:, None] % 3 == 0, 0.0, np.array([0.6, 0.0, 0.8]))
+
+
 def scene_object(
     number: int, poses: dict[int, np.ndarray], label: str | None = None, *, mesh: bool = True
 ) -> SceneObject:
@@ -74,6 +79,7 @@ def scene_object(
         points=center + rng.uniform(-0.5, 0.5, size=(50 * len(scans), 3)),
         point_scan=np.repeat(scans, 50),
         embedding=embedding(rng, center),
+        normals=upward(50 * len(scans)) if number % 2 else None,
         mesh=cube(center) if mesh else None,
     )
 

@@ -6,10 +6,11 @@ import dataclasses
 
 import numpy as np
 import pytest
-from factories import living_scene, turn_z
+from factories import embedding, living_scene, turn_z
+from scipy.spatial.transform import Rotation
 from small_scenes import CONFIG, MARK, piece
 
-from more2_jax.geometry.observations import own_points, with_poses
+from more2_jax.geometry.observations import own_normals, own_points, with_poses
 from more2_jax.geometry.poses import apply_pose
 from more2_jax.network.embedding_batch import embed
 from more2_jax.refinement.joint_of_objects import fit_objects
@@ -99,6 +100,25 @@ def test_an_accumulated_object_is_what_was_not_doubted_and_goes_back_without_a_c
     np.testing.assert_array_equal(same.points, o.points)
     for a, b in zip(same.observations, o.observations, strict=True):
         np.testing.assert_array_equal(a.T_ref_scan, b.T_ref_scan)
+
+
+def test_normals_turn_with_their_points_and_are_zero_where_a_scan_has_none():
+    rng = np.random.default_rng(0)
+    unit = rng.normal(size=(30, 3))
+    unit /= np.linalg.norm(unit, axis=1, keepdims=True)
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = Rotation.from_rotvec([0.3, -1.0, 2.0]).as_matrix(), [1.0, 2.0, 3.0]
+    knows, silent = (Instance(id=1, points=rng.normal(size=(30, 3)), normals=n) for n in (unit, None))
+    o = new_object(0, 0, silent, embedding(rng, np.zeros(3)))
+    assert o.normals is None
+    seen = dataclasses.replace(o.observations[0], scan=1, T_ref_scan=T)
+    both = seen_again(o, knows, seen)
+    assert both.normals is not None and not both.normals[:30].any()
+    np.testing.assert_allclose(both.normals[30:], unit @ T[:3, :3].T, atol=1e-12)
+    made = accumulated_object(both, [ScanRecord(index=k, name="", source="", instances=(1,)) for k in (0, 1)])
+    np.testing.assert_allclose(own_normals(made, 1), unit, atol=1e-12)
+    back = with_refined([both], [0], [with_poses(made, [np.eye(4), np.eye(4)])])[0]
+    np.testing.assert_allclose(back.normals, np.concatenate([np.zeros((30, 3)), unit]), atol=1e-12)
 
 
 def test_what_moves_is_written_back_and_what_is_doubted_stays(tiny_prior):
