@@ -251,8 +251,7 @@ class AccumulatedObject:
     observation: Integer[np.ndarray, " n"]  # that each point is of, 0 to k − 1
     poses: Float[np.ndarray, "k 4 4"]  # T_ref_scan; the first observation is held where others are moved
     embedding: Embedding  # NumPy leaves, unbatched; of all points together
-    # Unit, outward, in the object's frame; zeros where a point's is not known. None: nowhere.
-    normals: Float[np.ndarray, "n 3"] | None = None
+    normals: Float[np.ndarray, "n 3"] | None = None  # unit, outward; zeros where not known. None: nowhere
     # Of each observation, where its scan's sensors stood, in that scan's frame; (0, 3) where not known.
     sensors: tuple[Float[np.ndarray, "_ 3"], ...]
     # What was no object in the scan that saw it first, in the object's frame: its floor is that of this room.
@@ -336,8 +335,7 @@ class SceneObject:
     points: Float[np.ndarray, "n 3"]  # float64
     point_scan: Integer[np.ndarray, "n"]
     embedding: Embedding  # NumPy leaves, unbatched; frame of the reference observation
-    # Of `points`: unit, outward; zeros where not known. None: nowhere.
-    normals: Float[np.ndarray, "n 3"] | None = None
+    normals: Float[np.ndarray, "n 3"] | None = None  # unit, outward; zeros where not known. None: nowhere
     mesh: Mesh | None = None
     color: Color | None = None  # of the accumulated observations whose scans have colors
 
@@ -363,8 +361,7 @@ class Repair:
     object: str  # id of the whole
     instances: tuple[int, ...] = ()  # of the scan, that are parts of it, the one that was matched first
     absorbed: tuple[str, ...] = ()  # ids that parts of it had in the scene before
-    # Id of the other object that one mask held; `instances` is then that mask, of this scan.
-    divided: str | None = None
+    divided: str | None = None  # id of the other object that one mask, `instances`, held
     share: float = 1.0  # of the part, that lies on the whole
 
 

@@ -84,8 +84,10 @@ def inlier_points(
     sensors = seen_from(o) if meshing.mls_bandwidth else None
     factor = meshing.outlier_factor_multi_scan if in_several_scans(o) else meshing.outlier_factor
     kept = inliers(points, factor)
-    sides = (sensors, o.normals if meshing.mls_bandwidth else None)
-    return points[kept], *(None if x is None else uniform_subsample(x)[kept] for x in sides)
+    sensors = None if sensors is None else uniform_subsample(sensors)[kept]
+    if o.normals is None or not meshing.mls_bandwidth:
+        return points[kept], sensors, None
+    return points[kept], sensors, uniform_subsample(o.normals)[kept]
 
 
 def box_half_width(o: AccumulatedObject) -> float:

@@ -52,9 +52,8 @@ def padded_observations(
     most = bucket(max(len(o.poses) for o in objects), 2)
     together, _ = stack([o.embedding for o in objects])
     rows = [*objects, *[objects[0]] * (len(together.scale) - len(objects))]
-    clouds, normals = (
-        [[of(o, j) for j in range(len(o.poses))] for o in rows] for of in (own_points, own_normals)
-    )
+    clouds = [[own_points(o, j) for j in range(len(o.poses))] for o in rows]
+    normals = [[own_normals(o, j) for j in range(len(o.poses))] for o in rows]
     # The j-th observations of all objects are one batch: as large as a scan's instances, whose program encodes it.
     batches = [
         padded(
