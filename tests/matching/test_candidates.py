@@ -32,6 +32,8 @@ from more2_jax.network.prior import load_prior
 from more2_jax.registration.pose_costs import LIFTED, field_cost, off_field, off_fields
 from more2_jax.types import ObservedObject
 
+pytestmark = pytest.mark.quickly
+
 FIELDS = ("of_source", "of_target", "off_source", "off_target", "lift_m")
 
 

@@ -22,6 +22,8 @@ POINTS, COUNT = 512, 64
 off_both_ways = quick_jit(pose_costs.off_fields)
 surface_of = quick_jit(whole_surface)
 
+pytestmark = pytest.mark.quickly
+
 
 @pytest.fixture(scope="module")
 def prior():
