@@ -61,7 +61,7 @@ class PriorConfig:
 class SurfaceSearch:
     """How a pair's poses are searched: every start aligned by coarse surfaces, the few that fit best kept.
 
-    Lengths are shares of the target cloud's radius unless a name says otherwise. docs/relocalisation.md has what
+    Lengths are shares of the target cloud's radius unless a name says otherwise. docs/relocalization.md has what
     each is worth.
     """
 

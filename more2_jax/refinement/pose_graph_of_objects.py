@@ -31,7 +31,7 @@ SURFACE_POINTS, COMPARED_POINTS = 8192, 1024
 MAX_OBSERVATIONS = 32  # of an object: its first, and the last of the others; more stay as registered
 MIN_OBSERVATIONS = 4  # of the padded batch: objects seen two to four times share one compiled program
 # Poses are made better here, not found: among noise an observation that would turn farther has slipped along the
-# others (docs/relocalisation.md has a table of such limits).
+# others (docs/relocalization.md has a table of such limits).
 MAX_TURN_DEG = 3.0
 
 
