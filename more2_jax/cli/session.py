@@ -8,6 +8,7 @@ import sys
 import time
 from dataclasses import dataclass, field
 from datetime import datetime
+from importlib.metadata import version
 from pathlib import Path
 from types import TracebackType
 from typing import TextIO
@@ -28,6 +29,7 @@ from rich.table import Table
 from more2_jax.cli.options import Reporting
 from more2_jax.progress import STAGES, Progress
 
+EMITTERS, KNOWS_EMITTERS = "xla_cpu_use_fusion_emitters", ("0.9.", "0.10.")  # a flag of XLA; jaxlib's versions
 WIDTH = 120  # of lines where no terminal says how wide it is
 
 
@@ -150,8 +152,22 @@ def cache_folder() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "more2_jax"
 
 
+def compile_sooner() -> None:
+    """Has XLA leave out, on CPUs, an emitter of fused loops that costs much time and gains these programs none.
+
+    docs/performance.md has the figures. XLA stops at flags that it does not know: only versions that have it are told.
+    """
+    given = os.environ.get("XLA_FLAGS", "")
+    if version("jaxlib").startswith(KNOWS_EMITTERS) and EMITTERS not in given:
+        os.environ["XLA_FLAGS"] = f"{given} --{EMITTERS}=false".strip()
+
+
 def keep_compiled_programs() -> None:
-    """Has JAX keep compiled programs between runs; a folder set through JAX's own settings stays."""
+    """Has JAX keep compiled programs between runs, a folder set through JAX's own settings stays, and make them sooner.
+
+    Call it before anything is compiled.
+    """
+    compile_sooner()
     import jax
 
     if jax.config.values["jax_compilation_cache_dir"] is None:

@@ -1,5 +1,6 @@
 """Help, `more2 show`, `more2 export`, and where compiled programs are kept."""
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -7,7 +8,7 @@ from pathlib import Path
 import pytest
 from command_line import refused
 
-from more2_jax.cli import scenes
+from more2_jax.cli import scenes, session
 from more2_jax.cli.main import main
 from more2_jax.cli.session import cache_folder
 
@@ -87,3 +88,33 @@ def test_cache_folder_follows_the_environment(monkeypatch, tmp_path):
     monkeypatch.delenv("XDG_CACHE_HOME")
     monkeypatch.setattr(Path, "home", lambda: tmp_path)
     assert cache_folder() == tmp_path / ".cache/more2_jax"
+
+
+@pytest.mark.parametrize(
+    ("jaxlib", "given", "flags"),
+    [
+        ("0.10.2", None, "--xla_cpu_use_fusion_emitters=false"),
+        ("0.10.2", "--xla_dump_to=x", "--xla_dump_to=x --xla_cpu_use_fusion_emitters=false"),
+        ("0.10.2", "--xla_cpu_use_fusion_emitters=true", "--xla_cpu_use_fusion_emitters=true"),
+        ("0.13.0", None, None),  # XLA ends the process at a flag that it does not know
+    ],
+)
+def test_a_flag_of_the_compiler_is_added_where_it_is_known_and_not_given(monkeypatch, jaxlib, given, flags):
+    monkeypatch.setenv("XLA_FLAGS", given or "")
+    if given is None:
+        monkeypatch.delenv("XLA_FLAGS")
+    monkeypatch.setattr(session, "version", lambda package: {"jaxlib": jaxlib}[package])
+    for _ in range(2):
+        session.compile_sooner()
+        assert os.environ.get("XLA_FLAGS") == flags
+
+
+def test_a_command_compiles_with_that_flag(tmp_path):
+    command = "import os; from more2_jax.cli import session; session.keep_compiled_programs(); import jax;" + (
+        " print(jax.jit(lambda x: x + 1)(1), os.environ['XLA_FLAGS'])"
+    )
+    clean = {k: v for k, v in os.environ.items() if k != "XLA_FLAGS"}
+    done = subprocess.run(
+        [sys.executable, "-c", command], env=clean, capture_output=True, text=True, check=True
+    )
+    assert done.stdout.split() == ["2", "--xla_cpu_use_fusion_emitters=false"]
