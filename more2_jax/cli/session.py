@@ -29,7 +29,8 @@ from rich.table import Table
 from more2_jax.cli.options import Reporting
 from more2_jax.progress import STAGES, Progress
 
-EMITTERS, KNOWS_EMITTERS = "xla_cpu_use_fusion_emitters", ("0.9.", "0.10.")  # a flag of XLA; jaxlib's versions
+EMITTERS = "xla_cpu_use_fusion_emitters"  # a flag of XLA
+KNOWS_EMITTERS = ("0.9.", "0.10.")  # versions of jaxlib
 WIDTH = 120  # of lines where no terminal says how wide it is
 
 

@@ -110,9 +110,8 @@ def test_a_flag_of_the_compiler_is_added_where_it_is_known_and_not_given(monkeyp
 
 
 def test_a_command_compiles_with_that_flag(tmp_path):
-    command = "import os; from more2_jax.cli import session; session.keep_compiled_programs(); import jax;" + (
-        " print(jax.jit(lambda x: x + 1)(1), os.environ['XLA_FLAGS'])"
-    )
+    start = "import os; from more2_jax.cli import session; session.keep_compiled_programs(); import jax"
+    command = f"{start}; print(jax.jit(lambda x: x + 1)(1), os.environ['XLA_FLAGS'])"
     clean = {k: v for k, v in os.environ.items() if k != "XLA_FLAGS"}
     done = subprocess.run(
         [sys.executable, "-c", command], env=clean, capture_output=True, text=True, check=True
