@@ -1,6 +1,6 @@
 """How sure it is that two clouds show one object: the weights of `more2_jax.matching.calibration`, fitted on rooms.
 
-`python -m eval.calibration --data rooms/paper_free rooms/sparse_free`
+`python -m eval.calibration --data rooms/paper_free rooms/sparse_free --masks true eroded wrong`
 
 For other weights of the prior, or other kinds of rooms. Never on rooms that results are reported on.
 """
@@ -20,7 +20,9 @@ from scipy.optimize import minimize
 from scipy.special import expit
 
 from eval.data.flyingshape import flyingshape
+from eval.data.masks import DAMAGES, with_masks
 from eval.data.truth import KnownScene
+from eval.harness.options import Masks
 from more2_jax.config import EvidenceMatcher, SceneConfig, preset
 from more2_jax.matching.assignment import NEVER, assign
 from more2_jax.matching.calibration import FREE, UNASKED, UNKNOWN, UPRIGHT, Calibration, features, weighed
@@ -60,7 +62,13 @@ class ScanPair:
         return found
 
 
-def main(data: tuple[Path, ...], prior: str = "small", visits: int = 2, scenes: int = 0) -> None:
+def main(
+    data: tuple[Path, ...],
+    prior: str = "small",
+    visits: int = 2,
+    scenes: int = 0,
+    masks: tuple[Masks, ...] = ("true",),
+) -> None:
     """Fits the log odds of pairs of scans (first and every later one) and says how well they hold.
 
     Args:
@@ -68,6 +76,7 @@ def main(data: tuple[Path, ...], prior: str = "small", visits: int = 2, scenes: 
         prior: name of shipped weights, or a file.
         visits: scans of a room that take part, from the first; 0 for all.
         scenes: rooms of a folder, from the first; 0 for all.
+        masks: true, or damaged on purpose; every room is seen through each of them.
     """
     rooms = [flyingshape(folder) for folder in data]
     if len({r.upright for r in rooms}) != 1:
@@ -78,7 +87,9 @@ def main(data: tuple[Path, ...], prior: str = "small", visits: int = 2, scenes: 
     pairs: list[ScanPair] = []
     for folder, benchmark in zip(data, rooms, strict=True):
         for name in track(benchmark.names[: scenes or None], description=folder.name):
-            pairs += scan_pairs(f"{folder}/{name}", benchmark.read(name).first_scans(visits), weights, config)
+            scene = benchmark.read(name).first_scans(visits)
+            seen = [with_masks(scene, DAMAGES[m]) if m in DAMAGES else scene for m in masks]
+            pairs += [p for s in seen for p in scan_pairs(f"{folder}/{name}", s, weights, config)]
     if not pairs:
         raise ValueError(f"{', '.join(map(str, data))}: no room with two scans; needed one")
     report(pairs, asked(config), config)

@@ -154,7 +154,7 @@ def match_own(
         return {}
     old, new = (
         [
-            ObservedObject(points=i.points, embedding=e, color=color_of(i.colors))
+            ObservedObject(points=i.points, embedding=e, color=color_of(i.colors), normals=i.normals)
             for i, e in zip(*side, strict=True)
         ]
         for side in ((one, one_codes), (other, other_codes))

@@ -36,7 +36,7 @@ from more2_jax.config import (
 )
 from more2_jax.geometry.free_space import sight_of
 from more2_jax.network.prior import Prior
-from more2_jax.types import Embedding, ObservedObject, Scan, Sight
+from more2_jax.types import Embedding, Instance, ObservedObject, Scan, Sight
 from train.run.program import run
 
 CLOSED = "laid onto one another"
@@ -60,12 +60,16 @@ class TruePair:
     scan: int
 
     @property
+    def instances(self) -> tuple[Instance, Instance]:
+        """Source and target."""
+        own = self.object.instance
+        return self.scene.instance(self.scan, own[self.scan]), self.scene.instance(0, own[0])
+
+    @property
     def clouds(self) -> tuple[np.ndarray, np.ndarray]:
-        """Source and target, each in its scan's frame."""
-        o = self.object
-        return self.scene.instance(self.scan, o.instance[self.scan]).points, self.scene.instance(
-            0, o.instance[0]
-        ).points
+        """Their points, each in its scan's frame."""
+        source, target = self.instances
+        return source.points, target.points
 
     def sights(self) -> tuple[Sight | None, Sight | None]:
         """What the sensors of both scans saw around the object, where the data say how they stood."""
@@ -209,10 +213,14 @@ def ready_pairs(
     looking_s = (time.perf_counter() - began) / len(pairs)
     ready = [
         PairToRegister(
-            source=ObservedObject(points=s, embedding=codes[2 * k], sight=sights[k][0]),
-            target=ObservedObject(points=t, embedding=codes[2 * k + 1], sight=sights[k][1]),
+            source=ObservedObject(
+                points=s.points, embedding=codes[2 * k], sight=sights[k][0], normals=s.normals
+            ),
+            target=ObservedObject(
+                points=t.points, embedding=codes[2 * k + 1], sight=sights[k][1], normals=t.normals
+            ),
         )
-        for k, (s, t) in enumerate(clouds)
+        for k, (s, t) in enumerate(p.instances for p in pairs)
     ]
     return ready, encoding_s, looking_s
 

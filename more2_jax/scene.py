@@ -205,7 +205,7 @@ def compared_objects(
     of_instances = instance_sights(instances, scan, remembered(scan.background))
     old = [known_object(o, view, config) for o, view in zip(scene.objects, of_objects, strict=True)]
     new = [
-        ObservedObject(points=i.points, embedding=e, color=color_of(i.colors), sight=view)
+        ObservedObject(points=i.points, embedding=e, color=color_of(i.colors), sight=view, normals=i.normals)
         for i, e, view in zip(instances, embeddings, of_instances, strict=True)
     ]
     return old, new

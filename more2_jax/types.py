@@ -237,6 +237,8 @@ class ObservedObject:
     color: Color | None = quantity("invariant", default=None)
     # What sensors saw around it, where their places are known.
     sight: Sight | None = quantity("record", default=None)
+    # Unit, outward; zeros where not known. None: nowhere.
+    normals: Float[np.ndarray, "_ 3"] | None = quantity("direction", default=None)
 
 
 @dataclass(frozen=True, kw_only=True)

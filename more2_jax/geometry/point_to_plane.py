@@ -26,26 +26,43 @@ DAMPING = 1e-4  # of the normal equations, in shares of their trace: a ball may 
 NO_TILT = (1.0, 1.0, 1.0, 0.0, 0.0, 1.0)  # shift, and turn about the vertical
 WRITTEN_OUT = 6  # rows of a system: of a pose; what is larger would compile for longer than it runs
 ONE_AXIS = 1e-6  # of matrices of trace 1: what distinguishes eigenvalues by less is rounding
+SIDED_COSINE = 0.2  # an estimated normal within so much of a right angle to the scan's own has no side
+OPPOSED_COSINE = (
+    0.2  # a front lies on a back where their normals are farther apart than this beyond a right angle
+)
 NEIGHBORHOOD = 2.5  # half width of a normal's neighborhood, in median distances between neighbors
 
 
 @pytree
 class Surface:
-    """A cloud with normals, as a sample to compare and in full to be compared with. Normals have no side."""
+    """A cloud with normals, as a sample to compare and in full to be compared with."""
 
     sampled: Sampled = quantity("record")
     normals: Float[AnyArray, "*b n 3"] = quantity("direction")  # of the sample
     dense_normals: Float[AnyArray, "*b m 3"] = quantity("direction")
+    # Whether a normal is known to point outward, else it has no side. None: none is.
+    sided: Bool[AnyArray, "*b n"] | None = quantity("invariant", default=None)
+    dense_sided: Bool[AnyArray, "*b m"] | None = quantity("invariant", default=None)
     grid: NearestGrid | None = quantity(
         "record", default=None
     )  # names the nearest of `dense`; without it every distance is measured
 
 
-def whole_surface(points: Float[Array, "n 3"], mask: Bool[Array, " n"]) -> Surface:
-    """A cloud that is its own sample; `thinned` and `coarsened` make of it what is compared."""
+def whole_surface(
+    points: Float[Array, "n 3"], mask: Bool[Array, " n"], outward: Float[Array, "n 3"] | None = None
+) -> Surface:
+    """A cloud that is its own sample; `thinned` and `coarsened` make of it what is compared.
+
+    `outward`: the scan's own normals, zeros where not known; they say on which side the estimated ones are.
+    """
     normals = normal_estimator(points, mask)(points)
     cloud = Sampled(points=points, mask=mask, dense=points, dense_mask=mask)
-    return Surface(sampled=cloud, normals=normals, dense_normals=normals)
+    if outward is None:
+        return Surface(sampled=cloud, normals=normals, dense_normals=normals)
+    along = jnp.sum(normals * outward, axis=-1)
+    normals = jnp.where(along < 0, -1.0, 1.0)[:, None] * normals
+    sided = jnp.abs(along) > SIDED_COSINE
+    return Surface(sampled=cloud, normals=normals, dense_normals=normals, sided=sided, dense_sided=sided)
 
 
 def thinned(s: Surface, count: int) -> Surface:
@@ -53,15 +70,17 @@ def thinned(s: Surface, count: int) -> Surface:
     cloud = s.sampled
     index, real = thin(cloud.dense_mask, count)
     sampled = dataclasses.replace(cloud, points=cloud.dense[index], mask=real)
-    return dataclasses.replace(s, sampled=sampled, normals=s.dense_normals[index])
+    sided = None if s.dense_sided is None else s.dense_sided[index]
+    return dataclasses.replace(s, sampled=sampled, normals=s.dense_normals[index], sided=sided)
 
 
 def coarsened(s: Surface, count: int, dense: int, cells: int) -> Surface:
     """With about `dense` of all points, found by a table of `cells` a side, and about `count` for a sample."""
     index, real = thin(s.sampled.dense_mask, dense)
     points, normals = s.sampled.dense[index], s.dense_normals[index]
+    sided = None if s.dense_sided is None else s.dense_sided[index]
     cloud = Sampled(points=points, mask=real, dense=points, dense_mask=real)
-    fewer = Surface(sampled=cloud, normals=normals, dense_normals=normals)
+    fewer = Surface(sampled=cloud, normals=normals, dense_normals=normals, sided=sided, dense_sided=sided)
     return dataclasses.replace(thinned(fewer, count), grid=nearest_grid(points, real, cells))
 
 
@@ -153,10 +172,11 @@ class Correspondences:
     source_normal: Float[Array, "n 3"]
     target_normal: Float[Array, "n 3"]
     squared: Float[Array, " n"]  # `FAR` where there is none
+    opposed: Bool[Array, " n"] | None = None  # a front on a back; None where no sides are known
 
 
 def correspondences(T: jaxlie.SE3, source: Surface, target: Surface) -> Correspondences:
-    """Every sample's nearest point on the other cloud."""
+    """Every sample's nearest point on the other cloud, whichever side it shows."""
     R = T.rotation().as_matrix()
     s, t = source.sampled, target.sampled
     points = transformed(T, s.points)
@@ -165,13 +185,35 @@ def correspondences(T: jaxlie.SE3, source: Surface, target: Surface) -> Correspo
     a = jnp.concatenate([points, transformed(T, s.dense[back])])
     b = jnp.concatenate([t.dense[there], t.points])
     real = jnp.concatenate([s.mask & t.dense_mask[there], t.mask & s.dense_mask[back]])
+    own = jnp.concatenate([source.normals, source.dense_normals[back]]) @ R.T
+    other = jnp.concatenate([target.dense_normals[there], target.normals])
     return Correspondences(
         source=a,
         target=b,
-        source_normal=jnp.concatenate([source.normals, source.dense_normals[back]]) @ R.T,
-        target_normal=jnp.concatenate([target.dense_normals[there], target.normals]),
+        source_normal=own,
+        target_normal=other,
         squared=jnp.where(real, jnp.sum((a - b) ** 2, axis=-1), FAR),
+        opposed=opposed(source, target, there, back, jnp.sum(own * other, axis=-1)),
     )
+
+
+def opposed(
+    source: Surface,
+    target: Surface,
+    there: Int[Array, " s"],
+    back: Int[Array, " t"],
+    cosine: Float[Array, " n"],
+) -> Bool[Array, " n"] | None:
+    """Which correspondences hold a front against a back; None where a cloud has no known sides.
+
+    `there`, `back`: rows of the other cloud in full; `cosine`: of the angle between both normals.
+    """
+    sides = source.sided, source.dense_sided, target.sided, target.dense_sided
+    if any(s is None for s in sides):
+        return None
+    own, own_dense, other, other_dense = sides
+    known = jnp.concatenate([own & other_dense[there], other & own_dense[back]])  # type: ignore[operator,index]
+    return known & (cosine < -OPPOSED_COSINE)
 
 
 def closest(s: Surface, points: Float[Array, "n 3"]) -> Int[Array, " n"]:
@@ -195,7 +237,10 @@ class NormalEquations:
 def normal_equations(
     T: jaxlie.SE3, source: Surface, target: Surface, reach: Float[Array, ""]
 ) -> NormalEquations:
-    """Linearized at `T`; a correspondence as far apart as `reach` counts a quarter, one of crossed surfaces not."""
+    """Linearized at `T`; a correspondence as far apart as `reach` counts a quarter.
+
+    One of crossed surfaces does not count, nor one of a front and a back where the scans say which they are.
+    """
     c = correspondences(T, source, target)
     # Components first: sums over many points are then products of matrices with long rows, which are fast.
     points, gap = c.source.T, c.target.T - c.source.T
@@ -203,7 +248,8 @@ def normal_equations(
     agree = jnp.sum(own * other, axis=0)
     normal = other + jnp.where(agree < 0, -1.0, 1.0) * own
     normal = normal / jnp.sqrt(jnp.maximum(jnp.sum(normal**2, axis=0), 1e-12))
-    weight = jnp.where(c.squared < FAR, (reach**2 / (reach**2 + c.squared)) ** 2 * agree**2, 0.0)
+    counts = c.squared < FAR if c.opposed is None else (c.squared < FAR) & ~c.opposed
+    weight = jnp.where(counts, (reach**2 / (reach**2 + c.squared)) ** 2 * agree**2, 0.0)
     total = weight.sum()
     weight = weight / jnp.maximum(total, 1e-12)
     off = jnp.sum(normal * gap, axis=0)

@@ -85,7 +85,11 @@ def local_batch(objects: Sequence[ObservedObject], size: int | None = None) -> L
 
     Fillers repeat the first object; `size` is by default the next power of two.
     """
-    cloud = pad_batch(pad_clouds([o.points for o in objects], MAX_POINTS), size or bucket(len(objects)))
+    normals = [o.normals for o in objects]
+    known = None if all(n is None for n in normals) else normals
+    cloud = pad_batch(
+        pad_clouds([o.points for o in objects], MAX_POINTS, known), size or bucket(len(objects))
+    )
     origin = np.asarray(cloud.origin)
     rows = [objects[k if k < len(objects) else 0].embedding for k in range(len(origin))]
     code = jax.tree.map(lambda *x: np.stack(x), *rows)

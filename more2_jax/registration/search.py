@@ -63,7 +63,7 @@ def _alignable(batch: LocalBatch, search: SurfaceSearch) -> AlignableObject:
     def one(row: LocalBatch) -> AlignableObject:
         mask = row.cloud.mask
         points = jnp.where(mask[:, None], row.cloud.points, 0.0)  # NaN in masked rows goes no further
-        whole = whole_surface(points, mask)
+        whole = whole_surface(points, mask, row.cloud.normals)
         coarse = coarsened(whole, search.points, search.dense, search.cells)
         radius = cloud_radius(points, mask)
         return AlignableObject(whole=whole, coarse=coarse, radius=radius, code=row.code, sight=row.sight)

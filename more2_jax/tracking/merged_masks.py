@@ -149,6 +149,7 @@ class Compared:
                 embedding=p.embedding,
                 color=color_of(i.colors),
                 sight=self.new[p.whole].sight,
+                normals=i.normals,
             )
 
         return chosen(
@@ -174,7 +175,8 @@ class Compared:
 
         def half(p: Part) -> ObservedObject:
             o = objects[p.whole]
-            part = ObservedObject(points=o.points[p.rows], embedding=p.embedding, color=None)
+            normals = None if o.normals is None else o.normals[p.rows]
+            part = ObservedObject(points=o.points[p.rows], embedding=p.embedding, normals=normals)
             placed = transform(part, place_of(o.observations[-1]))
             return dataclasses.replace(placed, sight=self.old[p.whole].sight)
 

@@ -15,7 +15,7 @@ from more2_jax.network.prior import Prior
 from more2_jax.registration.pair_batch import PairBatch, local_batch, pair_up
 from more2_jax.registration.register import register
 from more2_jax.tracking.identify import Found, Identified
-from more2_jax.tracking.objects import accumulated_points, observation_in, place_of
+from more2_jax.tracking.objects import accumulated_normals, accumulated_points, observation_in, place_of
 from more2_jax.tracking.scan_frame import settled_frame
 from more2_jax.types import Frame, Instance, Observation, ObservedObject, Registration, SceneObject, Sight
 
@@ -26,15 +26,17 @@ def known_object(o: SceneObject, sight: Sight | None, config: SceneConfig) -> tu
     All seen so far where it last stood, or (`accumulate_target` False) the reference observation.
     """
     if config.accumulate_target:
-        points, T_scene_ref = accumulated_points(o), place_of(o.observations[-1])
+        points, normals = accumulated_points(o), accumulated_normals(o)
+        T_scene_ref = place_of(o.observations[-1])
     else:
         reference = observation_in(o, o.reference_scan)
         if reference is None:
             raise ValueError(
                 f"{o.id} has no observation in its reference scan {o.reference_scan}; needed one"
             )
-        points, T_scene_ref = o.points[o.point_scan == reference.scan], place_of(reference)
-    own = ObservedObject(points=points, embedding=o.embedding, color=o.color, sight=sight)
+        rows, T_scene_ref = o.point_scan == reference.scan, place_of(reference)
+        points, normals = o.points[rows], None if o.normals is None else o.normals[rows]
+    own = ObservedObject(points=points, embedding=o.embedding, color=o.color, sight=sight, normals=normals)
     return transform(own, T_scene_ref), np.linalg.inv(T_scene_ref)
 
 

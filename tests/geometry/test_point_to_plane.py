@@ -1,5 +1,7 @@
 """Surface alignment: normals against planes, steps against displacements, the covariance against repeated noise."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import jaxlie
@@ -33,9 +35,10 @@ def box_points(rng, size=(1.0, 0.6, 0.4), count=POINTS):
     return (points * size).astype(np.float32), axis
 
 
-def as_surface(points, mask=None):
+def as_surface(points, mask=None, outward=None):
     mask = np.ones(len(points), bool) if mask is None else mask
-    return whole_surface(jnp.asarray(points, jnp.float32), jnp.asarray(mask))
+    outward = None if outward is None else jnp.asarray(outward, jnp.float32)
+    return whole_surface(jnp.asarray(points, jnp.float32), jnp.asarray(mask), outward)
 
 
 aligned = jax.jit(align, static_argnames=("reach", "steps", "motion"))
@@ -114,6 +117,52 @@ def test_alignment_recovers_a_displacement_and_upright_never_tilts(motion):
     assert np.abs(np.asarray(T.translation()) - [0.03, -0.02, 0.04]).max() < 0.005
     if motion == "upright":
         np.testing.assert_allclose(R[2], [0, 0, 1], atol=1e-6)
+
+
+def test_normals_take_the_side_that_the_scan_says_and_have_none_where_it_does_not():
+    points, axis = box_points(np.random.default_rng(0))
+    outward = np.eye(3)[axis]
+    for sign in (1, -1):
+        given = sign * outward * (np.arange(len(points)) % 3 > 0)[:, None]  # of every third point not known
+        s = as_surface(points, outward=given)
+        sided, along = np.asarray(s.sided), np.sum(np.asarray(s.normals) * given, axis=1)
+        assert (along >= 0).all() and not sided[::3].any()
+        assert sided[np.arange(len(points)) % 3 > 0].mean() > 0.9
+    across = np.eye(3)[(axis + 1) % 3]  # along the surface: says nothing of its sides
+    assert np.asarray(as_surface(points, outward=across).sided).mean() < 0.3
+
+
+def plate(rng, height, up):
+    points = np.c_[rng.uniform(-0.5, 0.5, (POINTS, 2)), np.full(POINTS, height)]
+    return as_surface(points, outward=np.tile([0.0, 0.0, 1.0 if up else -1.0], (POINTS, 1)))
+
+
+@pytest.mark.parametrize(("up", "pulled"), [(True, True), (False, False)])
+def test_a_front_is_not_drawn_onto_a_back(up, pulled):
+    rng = np.random.default_rng(4)
+    front, other = plate(rng, 0.0, True), plate(rng, 0.05, up)
+    T = aligned(jaxlie.SE3.identity(), front, other, (0.15, 0.02), 25, "free")
+    assert float(T.translation()[2]) == pytest.approx(0.05 if pulled else 0.0, abs=1e-3)
+    without = dataclasses.replace(front, sided=None, dense_sided=None)
+    for pair in ((without, other), (other, without)):  # one side alone tells nothing
+        T = aligned(jaxlie.SE3.identity(), *pair, (0.15, 0.02), 25, "free")
+        assert abs(float(T.translation()[2])) == pytest.approx(0.05, abs=1e-3)
+
+
+def test_normals_of_no_known_side_change_nothing():
+    points, _ = box_points(np.random.default_rng(2))
+    moved = Rotation.from_euler("z", 12, degrees=True).apply(points) + [0.03, -0.02, 0.04]
+    bare, silent = (
+        aligned(jaxlie.SE3.identity(), *pair, (0.15, 0.02), 25, "free").wxyz_xyz
+        for pair in (
+            (as_surface(points), as_surface(moved)),
+            (
+                as_surface(points, outward=np.zeros_like(points)),
+                as_surface(moved, outward=np.zeros_like(points)),
+            ),
+        )
+    )
+    np.testing.assert_allclose(bare, silent, atol=1e-6)
 
 
 def test_degenerate_clouds_give_finite_poses():

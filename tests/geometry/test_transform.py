@@ -112,7 +112,9 @@ def records():
     far = np.array([1000.0, -2000.0, 5.0])
     bound = [dataclasses.replace(x, origin=far) for x in (cloud, code)]
     local = LocalBatch(cloud=cloud, code=code, sight=sight)
-    seen = ObservedObject(points=numbers(rng, 5, 3), embedding=bound[1], sight=sight)
+    seen = ObservedObject(
+        points=numbers(rng, 5, 3), embedding=bound[1], sight=sight, normals=numbers(rng, 5, 3)
+    )
     free = {
         "cloud": cloud,
         "anchors": anchors,

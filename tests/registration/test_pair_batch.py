@@ -184,3 +184,16 @@ def test_a_pair_far_away_is_registered_as_one_at_zero(tiny_prior):
         to_place = pieces.pose(Rotation.identity(), place)
         results.append(np.linalg.inv(to_place) @ T @ to_place)
     np.testing.assert_allclose(results[1], results[0], atol=1e-4)
+
+
+def test_normals_stay_with_their_points_and_clouds_without_have_zeros(objects):
+    rng = np.random.default_rng(3)
+    unit = rng.normal(size=objects[0].points.shape)
+    unit /= np.linalg.norm(unit, axis=1, keepdims=True)
+    batch = local_batch([dataclasses.replace(objects[0], normals=unit), *objects[1:]], 4)
+    assert local_batch(objects, 4).cloud.normals is None
+    turned, real = np.asarray(batch.cloud.normals), np.asarray(batch.cloud.mask[0])
+    assert not turned[1:3].any()
+    there = np.asarray(batch.cloud.points[0], np.float64)[real] + batch.origin[0]
+    row = np.linalg.norm(there[:, None] - objects[0].points, axis=-1).argmin(axis=1)
+    np.testing.assert_allclose(turned[0][real], unit[row], atol=1e-6)

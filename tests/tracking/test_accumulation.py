@@ -115,6 +115,10 @@ def test_normals_turn_with_their_points_and_are_zero_where_a_scan_has_none():
     both = seen_again(o, knows, seen)
     assert both.normals is not None and not both.normals[:30].any()
     np.testing.assert_allclose(both.normals[30:], unit @ T[:3, :3].T, atol=1e-12)
+    for whole in (True, False):  # as a new scan is compared with it: all seen so far, or the reference alone
+        placed, _ = known_object(both, None, dataclasses.replace(CONFIG, accumulate_target=whole))
+        expected = both.normals @ np.linalg.inv(T)[:3, :3].T if whole else np.zeros((30, 3))
+        np.testing.assert_allclose(placed.normals, expected, atol=1e-12)
     made = accumulated_object(both, [ScanRecord(index=k, name="", source="", instances=(1,)) for k in (0, 1)])
     np.testing.assert_allclose(own_normals(made, 1), unit, atol=1e-12)
     back = with_refined([both], [0], [with_poses(made, [np.eye(4), np.eye(4)])])[0]
