@@ -208,12 +208,12 @@ def opposed(
 
     `there`, `back`: rows of the other cloud in full; `cosine`: of the angle between both normals.
     """
-    sides = source.sided, source.dense_sided, target.sided, target.dense_sided
-    if any(s is None for s in sides):
+    if source.sided is None or source.dense_sided is None:
         return None
-    own, own_dense, other, other_dense = sides
-    known = jnp.concatenate([own & other_dense[there], other & own_dense[back]])  # type: ignore[operator,index]
-    return known & (cosine < -OPPOSED_COSINE)
+    if target.sided is None or target.dense_sided is None:
+        return None
+    known = source.sided & target.dense_sided[there], target.sided & source.dense_sided[back]
+    return jnp.concatenate(known) & (cosine < -OPPOSED_COSINE)
 
 
 def closest(s: Surface, points: Float[Array, "n 3"]) -> Int[Array, " n"]:
