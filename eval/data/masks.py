@@ -70,7 +70,7 @@ def merged(scan: Scan, rng: np.random.Generator) -> Scan:
         centers = np.stack([i.points.mean(axis=0) for i in instances])
         k = int(np.linalg.norm(centers - one.points.mean(axis=0), axis=1).argmin())
         both = np.concatenate([instances[k].points, one.points])
-        instances[k] = dataclasses.replace(instances[k], points=both, colors=None)
+        instances[k] = dataclasses.replace(instances[k], points=both, colors=None, normals=None)
     return dataclasses.replace(scan, instances=tuple(instances))
 
 
@@ -86,7 +86,9 @@ def split(scan: Scan, rng: np.random.Generator) -> Scan:
         side = (i.points - np.median(i.points, axis=0)) @ direction > 0
         for id_, half in ((i.id, side), (next_id, ~side)):
             if half.any():
-                instances.append(dataclasses.replace(i, id=id_, points=i.points[half], colors=None))
+                instances.append(
+                    dataclasses.replace(i, id=id_, points=i.points[half], colors=None, normals=None)
+                )
         next_id += 1
     return dataclasses.replace(scan, instances=tuple(instances))
 
@@ -122,7 +124,9 @@ def _some(scan: Scan) -> int:
 
 
 def _each(scan: Scan, change: Callable[[Points], Points]) -> Scan:
-    instances = tuple(dataclasses.replace(i, points=change(i.points), colors=None) for i in scan.instances)
+    instances = tuple(
+        dataclasses.replace(i, points=change(i.points), colors=None, normals=None) for i in scan.instances
+    )
     return dataclasses.replace(scan, instances=instances)
 
 

@@ -57,19 +57,19 @@ UPRIGHT = Calibration(
     intercept=4.9, nearer=-9.7, farther=-2.0, size=0.0, likeness=1.0, lift=-2.5, top=-12.7, raised=1.5
 )
 FREE = Calibration(
-    intercept=2.6,
-    nearer=-6.9,
+    intercept=4.5,
+    nearer=-9.4,
     farther=0.0,
-    size=-4.0,
-    likeness=7.25,
-    off_less=-11.1,
-    off_more=-6.5,
+    size=0.0,
+    likeness=4.3,
+    off_less=-4.5,
+    off_more=-10.8,
     raised=3.0,
 )
 
 
 # Without the prior's say.
-UNASKED = Calibration(intercept=1.2, nearer=-9.9, farther=-3.3, size=-4.2, likeness=5.7, raised=2.0)
+UNASKED = Calibration(intercept=3.7, nearer=-10.7, farther=-7.6, size=-0.5, likeness=5.0, raised=3.0)
 
 
 def calibrated(
