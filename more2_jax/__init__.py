@@ -28,7 +28,7 @@ _HOMES = {
     "geometry.padding": ("pad_clouds",),
     "geometry.points": ("chamfer_distance", "kabsch"),
     "matching.code_assignment": ("match_instances",),
-    "registration.register": ("register",),
+    "registration.register_pairs": ("register",),
     "registration.older_calls": ("world_pose",),
     "registration.pair_batch": ("PairBatch", "batch_of", "local_batch", "observe", "pair_up"),
     "meshing.extract": ("extract_mesh",),
@@ -49,7 +49,7 @@ if TYPE_CHECKING:
     from more2_jax.refinement.joint import fit_jointly
     from more2_jax.registration.older_calls import world_pose
     from more2_jax.registration.pair_batch import PairBatch, batch_of, local_batch, observe, pair_up
-    from more2_jax.registration.register import register
+    from more2_jax.registration.register_pairs import register
     from more2_jax.scans.read_scan import read_scan
     from more2_jax.scene import add_scan, reconstruct, start_scene
     from more2_jax.storage.scene_folder import load_scene, save_scene

@@ -103,7 +103,7 @@ MODULES = {
     "pose_graph": "more2_jax.refinement.pose_graph",
     "prior": "more2_jax.network.prior",
     "published": "more2_jax.network.published_weights",
-    "registration": "more2_jax.registration.register",
+    "registration": "more2_jax.registration.register_pairs",
     "screened_poisson": "more2_jax.meshing.screened_poisson",
     "seen_surface": "more2_jax.meshing.observed_surface",
     "sight": "more2_jax.geometry.free_space",

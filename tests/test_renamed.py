@@ -46,8 +46,8 @@ registration.world_pose closing.close_objects joint.fit_jointly meshing.extract_
 geometry.chamfer_distance prior.Prior prior.init_prior prior.load_prior prior.save_prior
 """
 FORMER, KEPT, DOCUMENTED = FORMER_LIST.split(), KEPT_LIST.split(), DOCUMENTED_LIST.split()
-# A module has the place of a function now: these two are reached by `more2_jax.register` and the command `more2`.
-HIDDEN = {("registration", "register"), ("cli", "main")}
+# A module has the place of a function now: it is reached by the command `more2`.
+HIDDEN = {("cli", "main")}
 # Functions of today in modules of their own name: 0.1.0 had neither.
 NEW = {("meshing", "observed_surface"), ("tracking", "identify")}
 

@@ -15,7 +15,7 @@ from more2_jax.geometry.poses import Points, Pose
 from more2_jax.network.embedding_batch import unstack
 from more2_jax.network.prior import Prior, encode
 from more2_jax.registration.pair_batch import local_batch, pair_up
-from more2_jax.registration.register import register
+from more2_jax.registration.register_pairs import register
 from more2_jax.types import Embedding, ObservedObject, PointCloud
 
 Tree = TypeVar("Tree")

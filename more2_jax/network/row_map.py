@@ -41,8 +41,8 @@ def chunked(function: Callable[[Tree], Tree], size: int, rows: Tree) -> Tree:
     """`function` of `rows` (leading axis b), in calls of `size` rows each: one compiled program whatever b is.
 
     Accelerators take `WIDER` times as many; several local devices take calls in turn, side by side. The last call is
-    filled up with its first row. Where anything is traced, the number of rows is part of a larger program anyway: they
-    go in one call. Results are host arrays, but for traced ones.
+    filled up with its first row; of no rows there is none. Where anything is traced, the number of rows is part of a
+    larger program anyway: they go in one call. Results are host arrays, but for traced ones.
     """
     leaves = jax.tree.leaves(rows)
     if traced(rows):
@@ -50,7 +50,9 @@ def chunked(function: Callable[[Tree], Tree], size: int, rows: Tree) -> Tree:
     size = size if jax.default_backend() == "cpu" else WIDER * size
     count, devices = len(leaves[0]), jax.local_devices()
     host, found = jax.tree.map(np.asarray, rows), []
-    for wave in range(0, max(count, 1), size * len(devices)):
+    if not count:
+        return _of_no_rows(function, host)
+    for wave in range(0, count, size * len(devices)):
         starts = range(wave, max(min(wave + size * len(devices), count), wave + 1), size)
         calls = []
         for device, start in zip(devices, starts, strict=False):
@@ -64,6 +66,12 @@ def chunked(function: Callable[[Tree], Tree], size: int, rows: Tree) -> Tree:
         for start, call in zip(starts, calls, strict=True):
             found.append(jax.tree.map(lambda x, n=count - start: x[:n], jax.device_get(call)))
     return jax.tree.map(lambda *x: np.concatenate(x), *found) if len(found) > 1 else found[0]
+
+
+def _of_no_rows(function: Callable[[Tree], Tree], rows: Tree) -> Tree:
+    """What `function` returns of no rows: nothing, in the shapes it has of one."""
+    one = jax.tree.map(lambda x: jax.ShapeDtypeStruct((1, *x.shape[1:]), x.dtype), rows)
+    return jax.tree.map(lambda x: np.zeros((0, *x.shape[1:]), x.dtype), jax.eval_shape(function, one))
 
 
 def traced(tree: Tree) -> bool:

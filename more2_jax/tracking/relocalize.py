@@ -13,7 +13,7 @@ from more2_jax.geometry.poses import Pose, local_poses
 from more2_jax.geometry.transform import transform
 from more2_jax.network.prior import Prior
 from more2_jax.registration.pair_batch import PairBatch, local_batch, pair_up
-from more2_jax.registration.register import register
+from more2_jax.registration.register_pairs import register
 from more2_jax.tracking.identify import Found, Identified
 from more2_jax.tracking.objects import accumulated_normals, accumulated_points, observation_in, place_of
 from more2_jax.tracking.scan_frame import settled_frame

@@ -35,6 +35,17 @@ def test_any_number_of_rows_gives_what_one_row_at_a_time_gives(program, count):
     assert all(isinstance(x, np.ndarray) and len(x) == count for x in jax.tree.leaves(found))
 
 
+def test_of_no_rows_there_is_nothing_in_the_shapes_of_one():
+    def called(rows):
+        return {"square": rows["x"] ** 2, "two": jnp.ones((len(rows["x"]), 2, 3), jnp.int32)}
+
+    found = chunked(called, SIZE, rows_of(0))
+    assert {k: (v.shape, v.dtype) for k, v in found.items()} == {
+        "square": ((0, 3), np.float32),
+        "two": ((0, 2, 3), np.int32),
+    }
+
+
 def test_the_number_of_rows_compiles_nothing_new(program):
     for count in range(1, 14):
         chunked(program, SIZE, rows_of(count))

@@ -14,7 +14,7 @@ from compiling import quick_jit
 from more2_jax.config import DescentRegistration, SurfaceRegistration, SurfaceSearch
 from more2_jax.network.prior import encode
 from more2_jax.registration.pair_batch import batch_of, pair_up
-from more2_jax.registration.register import register
+from more2_jax.registration.register_pairs import register
 from more2_jax.types import PointCloud
 
 pytestmark = pytest.mark.quickly

@@ -24,7 +24,7 @@ from more2_jax.registration.pair_batch import (
     paired_rows,
     take_pairs,
 )
-from more2_jax.registration.register import register
+from more2_jax.registration.register_pairs import register
 from more2_jax.types import ObservedObject
 
 pytestmark = pytest.mark.quickly

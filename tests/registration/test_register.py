@@ -22,7 +22,7 @@ from more2_jax.registration import register as registration
 from more2_jax.registration.descent import registration_loss, sampled
 from more2_jax.registration.pair_batch import batch_of, local_batch, pair_up
 from more2_jax.registration.pose_costs import APART_DEG, lowest_apart
-from more2_jax.registration.register import register
+from more2_jax.registration.register_pairs import register
 from more2_jax.registration.search import scaled_pose
 from more2_jax.types import ObservedObject
 
