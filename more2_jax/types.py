@@ -237,8 +237,9 @@ class ObservedObject:
     color: Color | None = quantity("invariant", default=None)
     # What sensors saw around it, where their places are known.
     sight: Sight | None = quantity("record", default=None)
-    # Unit, outward; zeros where not known. None: nowhere.
-    normals: Float[np.ndarray, "_ 3"] | None = quantity("direction", default=None)
+    normals: Float[np.ndarray, "_ 3"] | None = quantity(
+        "direction", default=None
+    )  # as an `Instance` has them
 
 
 @dataclass(frozen=True, kw_only=True)
