@@ -237,9 +237,7 @@ class ObservedObject:
     color: Color | None = quantity("invariant", default=None)
     # What sensors saw around it, where their places are known.
     sight: Sight | None = quantity("record", default=None)
-    normals: Float[np.ndarray, "_ 3"] | None = quantity(
-        "direction", default=None
-    )  # as an `Instance` has them
+    normals: Float[np.ndarray, "_ 3"] | None = quantity("direction", default=None)  # as in `Instance`
 
 
 @dataclass(frozen=True, kw_only=True)
