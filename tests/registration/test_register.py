@@ -18,7 +18,7 @@ from more2_jax.geometry.points import cloud_radius
 from more2_jax.geometry.transform import rescale
 from more2_jax.network.embedding_batch import embed
 from more2_jax.network.prior import encode, load_prior, sdf, shipped_priors
-from more2_jax.registration import register as registration
+from more2_jax.registration import register_pairs as registration
 from more2_jax.registration.descent import registration_loss, sampled
 from more2_jax.registration.pair_batch import batch_of, local_batch, pair_up
 from more2_jax.registration.pose_costs import APART_DEG, lowest_apart
