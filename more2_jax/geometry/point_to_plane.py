@@ -27,9 +27,7 @@ NO_TILT = (1.0, 1.0, 1.0, 0.0, 0.0, 1.0)  # shift, and turn about the vertical
 WRITTEN_OUT = 6  # rows of a system: of a pose; what is larger would compile for longer than it runs
 ONE_AXIS = 1e-6  # of matrices of trace 1: what distinguishes eigenvalues by less is rounding
 SIDED_COSINE = 0.2  # an estimated normal within so much of a right angle to the scan's own has no side
-OPPOSED_COSINE = (
-    0.2  # a front lies on a back where their normals are farther apart than this beyond a right angle
-)
+OPPOSED_COSINE = 0.2  # normals that face apart by more than this beyond a right angle: a front on a back
 NEIGHBORHOOD = 2.5  # half width of a normal's neighborhood, in median distances between neighbors
 
 
