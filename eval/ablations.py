@@ -137,7 +137,7 @@ def registration_study(
 def joint_study(
     scenes: Sequence[KnownScene], prior: Prior, config: SceneConfig, o: Settings
 ) -> list[tuple[str, Record]]:
-    """Nothing freed, and the five settings."""
+    """Poses as registered, then the joint optimization with each set of variables freed (`FREED`)."""
     seen = seen_objects(scenes, o.scans)
     start = registered(prior, seen, embedded(prior, seen, o.batch), config, o.batch)
     found = joint_records(seen, start, prior, config, "joint: nothing", o.samples)

@@ -203,7 +203,7 @@ class PoseGraphConfig:
 
 @dataclass(frozen=True)
 class SceneConfig:
-    """The whole method; `preset('paper')` is the paper to the letter, `preset('robust')` the default."""
+    """The whole method; `preset('paper')` follows the paper, `preset('robust')` is the default."""
 
     preset: str = "paper"  # whose settings these are, or began as
     upright: bool = False  # objects turn about the vertical (z) only

@@ -33,7 +33,7 @@ class Demo:
     out: Path = Path("demo_scene")
     """Folder of the living scene, saved after every scan; new, empty, or a living scene to replace."""
     preset: PresetName = "robust"
-    """robust: several starts a pair. paper: the method to the letter."""
+    """robust: several starts a pair. paper: as in the paper (docs/paper_map.md says what differs)."""
     upright: bool = True
     """Objects turn about the vertical (z) only."""
     prior: str = "small"
@@ -60,7 +60,7 @@ class Run:
     out: Path
     """Folder of the living scene, saved after every scan; new, empty, or a living scene to replace."""
     preset: PresetName = "robust"
-    """robust: several starts a pair. paper: the method to the letter."""
+    """robust: several starts a pair. paper: as in the paper (docs/paper_map.md says what differs)."""
     upright: bool = False
     """Objects turn about the vertical (z) only."""
     prior: str = "small"
@@ -274,7 +274,7 @@ class Settings:
     """
 
     preset: PresetName = "robust"
-    """robust: several starts a pair. paper: the method to the letter."""
+    """robust: several starts a pair. paper: as in the paper (docs/paper_map.md says what differs)."""
 
     def __call__(self) -> int:
         print(settings_page(scene_config(self.preset, False, None)), end="")
