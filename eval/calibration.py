@@ -38,7 +38,6 @@ from train.run.program import run
 
 RIDGE = 1e-6  # keeps weights finite where the rooms are told apart without a mistake
 SIGN = {"likeness": 1.0}  # the only evidence that speaks for a pair; all other speaks against it
-NEEDED = ("intercept", "nearer", "farther", "size", "likeness")  # what a `Calibration` must be told
 TAKEN_AWAY = 0.25  # share of objects and of instances, to see what rejection costs
 TIMES = 8  # that they are taken away anew
 
@@ -172,9 +171,7 @@ def fitted(pairs: Sequence[ScanPair], like: Calibration) -> Calibration:
     signs = [SIGN.get(k, -1.0) for k in names]
     bounds = [(None, None), *((0.0, None) if s > 0 else (None, 0.0) for s in signs)]
     w = minimize(loss, np.zeros(x.shape[1]), jac=True, bounds=bounds, method="L-BFGS-B").x
-    return Calibration(
-        **dict.fromkeys(NEEDED, 0.0) | dict(zip(["intercept", *names], w.tolist(), strict=True))
-    )
+    return Calibration(**{"likeness": 0.0} | dict(zip(["intercept", *names], w.tolist(), strict=True)))
 
 
 def left_out(pairs: Sequence[ScanPair], like: Calibration) -> dict[str, Calibration]:

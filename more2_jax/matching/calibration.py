@@ -14,7 +14,6 @@ from scipy.special import expit
 
 from more2_jax.config import MotionModel, SurfaceSearch
 from more2_jax.matching.pair_evidence import PairEvidence, asks_prior
-from more2_jax.registration.pose_costs import LIFTED
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,12 +34,15 @@ class Calibration:
     """
 
     intercept: float
-    nearer: float  # of the smaller mean truncated distance of the two ways,
-    farther: float  # and of the larger
-    size: float
     likeness: float
-    lift: float = 0.0  # of a change of height, in shares of `LIFTED` of the radius, at most 1
-    top: float = 0.0  # of `top_m`, in shares of the radius, at most `HIGHEST`
+    size: float = 0.0
+    nearer: float = 0.0  # of the smaller mean distance of the two ways, truncated at a share of the radius,
+    farther: float = 0.0  # and of the larger
+    apart_less: float = 0.0  # of the smaller mean distance of the two ways, truncated at `APART_M`,
+    apart_more: float = 0.0  # and of the larger
+    contradicted: float = 0.0  # of the share of either cloud where the other scan shows empty space
+    lift: float = 0.0  # of a change of height, in shares of `MOST_LIFT_M`, at most 1
+    top: float = 0.0  # of `top_m`, in shares of `HIGHEST_M`, at most 1
     off_less: float = 0.0  # of the smaller distance off the other's completed surface,
     off_more: float = 0.0  # and of the larger
     # Of the intercept, by how much it lowers the threshold of an assignment: pairs that win one are likelier right than
@@ -48,19 +50,25 @@ class Calibration:
     raised: float = 0.0
 
 
-HIGHEST = 0.2
+MOST_LIFT_M = 0.05  # what scans of things that stand on a floor differ in height by noise alone, and more
+HIGHEST_M = 0.05  # a mask that is cut at the top hides how high the object is
 UNKNOWN = 0.5  # of `off_own`: a prior that lays a cloud so far off its own surface has no say
 
 
 # Logistic regression on pairs of validation rooms; how, and how well it holds, is in docs/relocalization.md.
 UPRIGHT = Calibration(
-    intercept=4.9, nearer=-9.7, farther=-2.0, size=0.0, likeness=1.0, lift=-2.5, top=-12.7, raised=1.5
+    intercept=7.0,
+    likeness=1.3,
+    apart_less=-5.1,
+    apart_more=-1.2,
+    contradicted=-6.4,
+    lift=-2.5,
+    top=-2.9,
+    raised=2.0,
 )
 FREE = Calibration(
     intercept=4.5,
     nearer=-9.4,
-    farther=0.0,
-    size=0.0,
     likeness=4.3,
     off_less=-4.5,
     off_more=-10.8,
@@ -110,14 +118,18 @@ def weighed(known: dict[str, Float[np.ndarray, "*pairs"]], c: Calibration) -> Fl
 def features(evidence: PairEvidence, compared: Compared) -> dict[str, Float[np.ndarray, "*pairs"]]:
     """What each weight of a `Calibration` is multiplied with, by its name."""
     ways = np.stack([evidence.of_source, evidence.of_target])
+    apart = np.stack([evidence.apart_source, evidence.apart_target])
     off = np.stack([evidence.off_source, evidence.off_target])
     return {
         "nearer": ways.min(axis=0),
         "farther": ways.max(axis=0),
         "size": compared.size,
         "likeness": compared.likeness,
-        "lift": np.minimum(evidence.lift_m / (LIFTED * evidence.radius_m), 1.0),
-        "top": np.minimum(compared.top_m / evidence.radius_m, HIGHEST),
+        "apart_less": apart.min(axis=0),
+        "apart_more": apart.max(axis=0),
+        "contradicted": evidence.contradicted,
+        "lift": np.minimum(evidence.lift_m / MOST_LIFT_M, 1.0),
+        "top": np.minimum(compared.top_m / HIGHEST_M, 1.0),
         "off_less": off.min(axis=0),
         "off_more": off.max(axis=0),
     }

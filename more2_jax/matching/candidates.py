@@ -19,6 +19,7 @@ from more2_jax.geometry.poses import Pose
 from more2_jax.matching.assignment import NEVER, LogOdds
 from more2_jax.matching.calibration import Compared, calibrated
 from more2_jax.matching.color import color_evidence
+from more2_jax.matching.metric_evidence import MetricEvidence, Seen, metric_evidence, seen_in
 from more2_jax.matching.pair_evidence import (
     PairEvidence,
     asks_prior,
@@ -47,6 +48,8 @@ class AlignedPairs:
     top_gap_m: Float[np.ndarray, " p"]  # by how much the object's top is higher than the instance's
     off: Float[np.ndarray, "p k 2"]  # off the completed surfaces; 0 where that is not asked
     off_own: Float[np.ndarray, " p"]
+    seen: Seen | None = None  # what both scans saw; None where that is no evidence (any orientation)
+    metric: MetricEvidence | None = None
     height_m: float = 0.0  # upright: that the scan was taken to lie at
 
     def take(self, chosen: Sequence[tuple[int, int]]) -> PairBatch:
@@ -66,10 +69,12 @@ def align_candidates(
     matcher: EvidenceMatcher,
     motion: MotionModel,
     T_scene_scan: Pose | None = None,
+    seen: Seen | None = None,
 ) -> AlignedPairs:
     """Aligns the likeliest pairs of `old` (scene's frame) and `new` (scan's frame).
 
-    `T_scene_scan`: how the scan is taken to lie, for what did not move; by default in the scene's frame. Raises
+    `T_scene_scan`: how the scan is taken to lie, for what did not move; by default in the scene's frame. `seen`: what
+    the scene so far and the new scan show, upright; by default the objects and the instances themselves. Raises
     ValueError as `check_asked` does.
     """
     check_asked(prior, (*old, *new), matcher, motion)
@@ -87,12 +92,18 @@ def align_candidates(
     if asks_prior(matcher.search, motion):
         found, off = off_completed_surfaces(prior, instances, objects, found, matcher.search)
         own = np.max([off_own_surface(prior, x)[at] for x, at in zip(ready, rows.T, strict=True)], axis=0)
+    T_old_new, metric = pairs.to_world(found.poses), None
+    if motion == "upright":
+        seen = seen or seen_in(old, new)
+        metric = metric_evidence((new, old), sides, tuple(ready), rows, T_old_new, seen)  # type: ignore[arg-type]
     return AlignedPairs(
         among=among,
         pairs=pairs,
         objects=(instances, objects),
         found=found,
-        T_old_new=pairs.to_world(found.poses),
+        T_old_new=T_old_new,
+        seen=seen,
+        metric=metric,
         compared=Compared(**{k: v[among] for k, v in vars(known).items()}),
         top_gap_m=(heights(old)[1][:, None] - heights(new)[1])[among],
         off=off,
@@ -141,6 +152,9 @@ def evidence_at(
         cost = np.asarray(found.cost) - height_penalty(np.abs(z - stayed), radius, search)
         best = np.argmin(cost + height_penalty(lift, radius, search), axis=1)
     at = np.arange(len(best)), best
+    apart, contradicted = np.zeros((len(best), 2)), np.zeros(len(best))
+    if aligned.metric is not None:
+        apart, contradicted = aligned.metric.apart[at], aligned.metric.contradicted[at]
     return PairEvidence(
         pose=best,
         of_source=np.asarray(found.of_source)[at],
@@ -150,6 +164,9 @@ def evidence_at(
         off_source=aligned.off[at][:, 0],
         off_target=aligned.off[at][:, 1],
         off_own=aligned.off_own,
+        apart_source=apart[:, 0],
+        apart_target=apart[:, 1],
+        contradicted=contradicted,
     )
 
 

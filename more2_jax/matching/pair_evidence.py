@@ -43,6 +43,10 @@ class PairEvidence:
     off_source: Float[np.ndarray, " p"]
     off_target: Float[np.ndarray, " p"]
     off_own: Float[np.ndarray, " p"]
+    # Upright (`MetricEvidence`): mean distances in shares of `APART_M`, and the share in empty space. Else 0.
+    apart_source: Float[np.ndarray, " p"]
+    apart_target: Float[np.ndarray, " p"]
+    contradicted: Float[np.ndarray, " p"]
 
 
 def asks_prior(search: SurfaceSearch, motion: MotionModel) -> bool:

@@ -220,7 +220,8 @@ class Compared:
         """Log odds of halves with what they may be."""
         matcher = dataclasses.replace(self.matcher, candidates=CANDIDATES)
         T = self.identified.frame.T_scene_scan
-        aligned = align_candidates(self.prior, list(old), list(new), matcher, self.config.motion, T)
+        sides, seen = (list(old), list(new)), self.aligned.seen
+        aligned = align_candidates(self.prior, *sides, matcher, self.config.motion, T, seen)
         return odds_of(aligned, matcher.search, self.config.motion, self.height_m())
 
     def halves(

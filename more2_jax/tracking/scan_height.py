@@ -21,6 +21,7 @@ from more2_jax.matching.candidates import (
     odds_of,
     proposal_of,
 )
+from more2_jax.matching.metric_evidence import seen_in
 from more2_jax.network.prior import Prior
 from more2_jax.types import ObservedObject
 
@@ -82,7 +83,8 @@ def common_height(
     floors = [floor_height(p) for p in (rooms.scene, rooms.scan)]
     between_m = 0.0 if floors[0] is None or floors[1] is None else floors[0] - floors[1]
     lifts_m = {between_m} | ({best_vote(votes, weights)} if doubtful(votes, weights) else set())
-    aligned = align_candidates(prior, old, new, matcher, "upright")
+    seen = seen_in(old, new, rooms.scene, rooms.scan)
+    aligned = align_candidates(prior, old, new, matcher, "upright", seen=seen)
     none = weighed_at(aligned, matcher, 0.0)
     lifted = {m: lifted_by(m, prior, old, new, matcher, aligned) for m in lifts_m if abs(m) > LEAST_M}
     expected = none
@@ -102,7 +104,8 @@ def lifted_by(
 ) -> Weighed:
     """The pairs at a lift; aligned anew for one too large for an alignment to find from where it was."""
     if abs(height_m) > OUT_OF_REACH_M:
-        aligned = align_candidates(prior, old, new, matcher, "upright", vertical_shift(height_m))
+        lift = vertical_shift(height_m)
+        aligned = align_candidates(prior, old, new, matcher, "upright", lift, aligned.seen)
     return settled_height(aligned, matcher, height_m)
 
 

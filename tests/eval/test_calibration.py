@@ -34,7 +34,7 @@ PLANTED = Calibration(intercept=2.0, nearer=-6.0, farther=0.0, size=-3.0, likene
 def drawn(room: str, count: int, seed: int, c: Calibration = PLANTED) -> ScanPair:
     """Pairs whose truth was drawn with the probability that `c` gives them."""
     rng = np.random.default_rng(seed)
-    names = ("nearer", "farther", "size", "likeness", "lift", "top", "off_less", "off_more")
+    names = [k for k in dataclasses.asdict(c) if k not in ("intercept", "raised")]
     known = {k: rng.uniform(size=count) for k in names}
     told = c.intercept + sum(getattr(c, k) * v for k, v in known.items())
     one = rng.random(count) < expit(told)

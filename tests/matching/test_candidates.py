@@ -16,7 +16,8 @@ from more2_jax.geometry.poses import vertical_shift
 from more2_jax.matching.assignment import NEVER, assign, interchangeable, unmatched
 from more2_jax.matching.calibration import (
     FREE,
-    HIGHEST,
+    HIGHEST_M,
+    MOST_LIFT_M,
     UNASKED,
     UNKNOWN,
     UPRIGHT,
@@ -29,12 +30,15 @@ from more2_jax.matching.candidates import align_candidates, evidence_at, odds_of
 from more2_jax.matching.pair_evidence import PairEvidence
 from more2_jax.network.embedding_batch import embed
 from more2_jax.network.prior import load_prior
-from more2_jax.registration.pose_costs import LIFTED, field_cost, off_field, off_fields
+from more2_jax.registration.pose_costs import field_cost, off_field, off_fields
 from more2_jax.types import ObservedObject
 
 pytestmark = pytest.mark.quickly
 
-FIELDS = ("of_source", "of_target", "off_source", "off_target", "lift_m")
+FIELDS = (
+    *("of_source", "of_target", "off_source", "off_target", "apart_source", "apart_target"),
+    *("contradicted", "lift_m"),
+)
 
 
 def box(rng, size, count=600):
@@ -83,12 +87,13 @@ def test_log_odds_are_linear_and_the_two_ways_have_no_order():
         top=7.0,
         off_less=8.0,
         off_more=9.0,
+        apart_less=10.0,
+        apart_more=11.0,
+        contradicted=12.0,
     )
-    by_hand = 1 + 4 * known.size + 5 * known.likeness + known.color
-    by_hand += 6 * np.minimum(values["lift_m"] / (LIFTED * 0.5), 1) + 7 * np.minimum(
-        known.top_m / 0.5, HIGHEST
-    )
-    for k, less, more in (("of", 2, 3), ("off", 8, 9)):
+    by_hand = 1 + 4 * known.size + 5 * known.likeness + known.color + 12 * values["contradicted"]
+    by_hand += 6 * np.minimum(values["lift_m"] / MOST_LIFT_M, 1) + 7 * np.minimum(known.top_m / HIGHEST_M, 1)
+    for k, less, more in (("of", 2, 3), ("off", 8, 9), ("apart", 10, 11)):
         a, b = values[f"{k}_source"], values[f"{k}_target"]
         by_hand += less * np.minimum(a, b) + more * np.maximum(a, b)
     np.testing.assert_allclose(log_odds(evidence, known, c), by_hand)
@@ -111,6 +116,9 @@ def test_the_prior_is_asked_in_any_orientation_alone_and_only_where_it_knows_the
     without = dataclasses.replace(search, field_weight=0.0)
     np.testing.assert_array_equal(calibrated(evidence, known, without, "free"), by[UNASKED])
     assert not (UPRIGHT.off_less or UPRIGHT.off_more or UNASKED.off_less or UNASKED.off_more)
+    # Upright, distances are in meters and scans say what is empty; in any orientation neither is asked.
+    assert not (UPRIGHT.nearer or UPRIGHT.farther)
+    assert not any((c.apart_less, c.apart_more, c.contradicted) != (0, 0, 0) for c in (FREE, UNASKED))
 
 
 def observed(prior, clouds):
@@ -204,7 +212,8 @@ def test_a_height_weighed_afterwards_is_that_height_searched_at(tiny_prior, lift
     weighed = odds_of(below, matcher.search, "upright", height_m)
     searched = odds_of(there, matcher.search, "upright", height_m)
     np.testing.assert_array_equal(weighed > 0, searched > 0)
-    np.testing.assert_allclose(weighed, searched, atol=0.3)
+    # Boxes of different sizes fit in several poses about as badly: which of these is best may differ.
+    np.testing.assert_allclose(np.diag(weighed), np.diag(searched), atol=0.3)
     assert np.abs(weighed - odds_of(below, matcher.search, "upright", 0.0)).max() > 0.3
 
 

@@ -1,0 +1,100 @@
+"""How far pairs of clouds lie apart in meters, and what of them the other scan shows to be empty space (upright).
+
+Beyond the paper (`EvidenceMatcher`). What keeps two scans of one object apart (a sensor's noise, drift, the voxels of
+fusion) is so many centimeters whatever the size of the object. And a mask that is cut or dirty changes what an object
+has, not what its scan saw: points that the other cloud lacks speak against a pair only where the other scan looked and
+found nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.spatial import KDTree
+
+from more2_jax.geometry.poses import Points, apply_pose
+from more2_jax.geometry.seen_space import SeenSpace
+from more2_jax.registration.search import AlignableObject
+from more2_jax.types import LocalBatch, ObservedObject
+
+APART_M = 0.08  # a point farther from the other cloud counts as this far; chosen as `seen_space.CELL_M`
+
+Seen = tuple[SeenSpace, SeenSpace]  # of the scene so far, and of the new scan, each in its own frame
+
+
+NOWHERE = np.zeros((0, 3))
+
+
+def seen_in(
+    old: Sequence[ObservedObject],
+    new: Sequence[ObservedObject],
+    scene: Points = NOWHERE,
+    scan: Points = NOWHERE,
+) -> Seen:
+    """All that the scene so far shows (its objects and `scene`) and all that the new scan shows, upright."""
+    old_space, new_space = (
+        SeenSpace(np.concatenate([rest, *(o.points for o in side)]))
+        for rest, side in ((scene, old), (scan, new))
+    )
+    return old_space, new_space
+
+
+@dataclass(frozen=True, kw_only=True)
+class MetricEvidence:
+    """Of p pairs at k poses each; source: the new scan's instance, target: the scene's object."""
+
+    apart: Float[
+        np.ndarray, "p k 2"
+    ]  # mean distances of source and target, shares of `APART_M` that truncates them
+    contradicted: Float[
+        np.ndarray, "p k"
+    ]  # the larger of the shares of both that lie in the other's empty space
+
+
+def metric_evidence(
+    sides: tuple[Sequence[ObservedObject], Sequence[ObservedObject]],
+    batches: tuple[LocalBatch, LocalBatch],
+    ready: tuple[AlignableObject, AlignableObject],
+    pairs: Int[np.ndarray, "p 2"],
+    T_old_new: Float[np.ndarray, "p k 4 4"],
+    seen: Seen,
+) -> MetricEvidence:
+    """Compares samples of instances and objects with all of the other cloud, and of the other scan.
+
+    `sides`, `batches`, `ready`: instances (new scan's frame), then objects (scene's frame). `pairs`: rows of both.
+    """
+    trees = [[KDTree(o.points) for o in side] for side in sides]
+    samples = [samples_of(x, b, len(side)) for x, b, side in zip(ready, batches, sides, strict=True)]
+    apart = np.zeros((*T_old_new.shape[:2], 2))
+    empty = np.zeros_like(apart)
+    for way, space in ((0, seen[0]), (1, seen[1])):
+        poses = T_old_new if way == 0 else np.linalg.inv(T_old_new)
+        moved = [
+            apply_pose(T, samples[way][pair[way]])
+            for pair, of_pair in zip(pairs, poses, strict=True)
+            for T in of_pair
+        ]
+        others = np.repeat(pairs[:, 1 - way], T_old_new.shape[1])
+        apart[..., way] = np.reshape(
+            [mean_apart(trees[1 - way][o], p) for o, p in zip(others, moved, strict=True)], apart.shape[:2]
+        )
+        ends = np.cumsum([len(p) for p in moved])[:-1]
+        lies_empty = space.empty(np.concatenate(moved), APART_M)
+        empty[..., way] = np.reshape([e.mean() for e in np.split(lies_empty, ends)], apart.shape[:2])
+    return MetricEvidence(apart=apart, contradicted=empty.max(axis=-1))
+
+
+def samples_of(ready: AlignableObject, batch: LocalBatch, count: int) -> list[Float[np.ndarray, "_ 3"]]:
+    """What the search compares of every object, in its scan's frame; float64."""
+    points, mask = np.asarray(ready.coarse.sampled.points, np.float64), np.asarray(ready.coarse.sampled.mask)
+    origin = np.zeros((len(points), 3)) if batch.origin is None else np.asarray(batch.origin, np.float64)
+    return [points[k][mask[k]] + origin[k] for k in range(count)]
+
+
+def mean_apart(tree: KDTree, points: Float[np.ndarray, "n 3"]) -> float:
+    """Mean distance of points from a cloud, truncated at `APART_M` and as a share of it."""
+    nearest, _ = tree.query(points, distance_upper_bound=APART_M)
+    return float(np.minimum(nearest / APART_M, 1.0).mean())

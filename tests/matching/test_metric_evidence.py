@@ -1,0 +1,132 @@
+"""Distances in meters between pairs of clouds, and what of them the other scan shows to be empty."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial import KDTree
+
+from more2_jax.config import EvidenceMatcher, SurfaceSearch
+from more2_jax.geometry.poses import apply_pose
+from more2_jax.matching.calibration import UPRIGHT
+from more2_jax.matching.candidates import align_candidates, odds_of
+from more2_jax.matching.metric_evidence import APART_M, metric_evidence, seen_in
+from more2_jax.network.embedding_batch import embed
+from more2_jax.registration.pair_batch import local_batch
+from more2_jax.registration.search import alignable
+from more2_jax.types import ObservedObject
+
+pytestmark = pytest.mark.quickly
+
+SEARCH = SurfaceSearch(points=64, dense=128, cells=8, turns=4, steps=2)
+UP = np.array([[0.0, -1, 0, 0.3], [1, 0, 0, 0.2], [0, 0, 1, 0.05], [0, 0, 0, 1]])
+
+
+def box(size, at, count=500, seed=0):
+    """Points on the surface of a box that stands on z = 0."""
+    rng = np.random.default_rng(seed)
+    points = rng.uniform(-0.5, 0.5, (count, 3))
+    points[np.arange(count), rng.integers(0, 3, count)] = rng.choice([-0.5, 0.5], count)
+    return (points + [0, 0, 0.5]) * size + at
+
+
+def floor(side=6.0):
+    x = np.arange(-1.0, side, 0.07)
+    return np.stack([*np.meshgrid(x, x), np.zeros((len(x), len(x)))], axis=-1).reshape(-1, 3)
+
+
+@pytest.fixture(scope="module")
+def scans(tiny_prior):
+    """Two boxes of the scene, and of a scan."""
+
+    def observed(clouds):
+        return [
+            ObservedObject(points=p, embedding=e)
+            for p, e in zip(clouds, embed(tiny_prior, clouds), strict=True)
+        ]
+
+    old = observed([box([1, 0.5, 0.7], [0, 0, 0]), box([0.4, 0.4, 1.2], [3, 0, 0], seed=1)])
+    new = observed([box([1, 0.5, 0.7], [0.5, 2, 0], seed=2), box([0.4, 0.4, 1.2], [3, 3, 0], seed=3)])
+    return old, new
+
+
+def compare(scans, pairs, poses, seen):
+    old, new = scans
+    batches = local_batch(new), local_batch(old)
+    ready = tuple(alignable(b, SEARCH) for b in batches)
+    return metric_evidence((new, old), batches, ready, np.array(pairs), np.array(poses), seen), batches, ready
+
+
+def test_by_definition_of_every_pair_and_pose(scans):
+    old, new = scans
+    seen = seen_in(old, new, floor(), floor())
+    poses = np.stack([np.stack([UP, np.eye(4)])] * 2)
+    found, batches, ready = compare(scans, [[0, 0], [1, 0]], poses, seen)
+    for p, (i, k) in enumerate([(0, 0), (1, 0)]):
+        for q, T in enumerate((UP, np.eye(4))):
+            shares = []
+            for way, (row, cloud, X) in enumerate(((i, old[k], T), (k, new[i], np.linalg.inv(T)))):
+                sampled = ready[way].coarse.sampled
+                own = np.asarray(sampled.points[row], np.float64)[np.asarray(sampled.mask[row])]
+                moved = apply_pose(X, own + batches[way].origin[row])
+                by_hand = np.minimum(KDTree(cloud.points).query(moved)[0] / APART_M, 1).mean()
+                assert found.apart[p, q, way] == pytest.approx(by_hand, abs=1e-9)
+                shares.append(seen[way].empty(moved, APART_M).mean())
+            assert found.contradicted[p, q] == pytest.approx(max(shares))
+
+
+def test_moving_a_scan_as_a_whole_changes_nothing(tiny_prior, scans):
+    """By whole columns: which points share one is what a scan's own grid says."""
+    old, new = scans
+    room = floor()
+    shift = np.array([3.0, -1.5, 0.4])  # 20 and 10 columns
+    matcher = EvidenceMatcher(search=SEARCH)
+    there = [dataclasses.replace(o, points=o.points + shift) for o in new]
+    there = [
+        dataclasses.replace(o, embedding=e)
+        for o, e in zip(there, embed(tiny_prior, [o.points for o in there]), strict=True)
+    ]
+    back = np.eye(4)
+    back[:3, 3] = -shift
+    here = align_candidates(tiny_prior, old, new, matcher, "upright", None, seen_in(old, new, room, room))
+    moved = align_candidates(
+        tiny_prior, old, there, matcher, "upright", back, seen_in(old, there, room, room + shift)
+    )
+    np.testing.assert_allclose(moved.metric.apart, here.metric.apart, atol=2e-3)
+    np.testing.assert_allclose(moved.metric.contradicted, here.metric.contradicted, atol=0.05)
+
+
+def test_a_half_whose_other_half_is_in_the_background_is_not_contradicted(tiny_prior, scans):
+    """A mask that is cut: what it lost is still in its scan. Where nothing stands there, the scan says so."""
+    old, _ = scans
+    whole = box([1, 0.5, 0.7], [0.5, 2, 0], count=4000, seed=2)
+    left = whole[:, 0] < np.median(whole[:, 0])
+    half = [ObservedObject(points=whole[left], embedding=embed(tiny_prior, [whole[left]])[0])]
+    T = np.eye(4)
+    T[:3, 3] = [-0.5, -2, 0]
+    cut, gone = (
+        compare((old, half), [[0, 0]], [[T]], seen_in(old, half, floor(), rest))[0].contradicted[0, 0]
+        for rest in (np.concatenate([floor(), whole[~left]]), floor())
+    )
+    assert cut < 0.05
+    assert gone > 0.3
+
+
+def test_empty_space_lowers_the_odds_and_is_asked_upright_alone(tiny_prior, scans):
+    old, new = scans
+    matcher = EvidenceMatcher(search=SEARCH)
+    with_room, without = (
+        align_candidates(tiny_prior, old, new, matcher, "upright", None, seen_in(old, new, room, room))
+        for room in (floor(), np.zeros((0, 3)))
+    )
+    more, less = (odds_of(x, SEARCH, "upright") for x in (without, with_room))
+    among = with_room.among
+    shares = with_room.metric.contradicted[:, 0] - without.metric.contradicted[:, 0]
+    assert (shares >= 0).all() and shares.max() > 0.05
+    np.testing.assert_allclose((less - more)[among], UPRIGHT.contradicted * shares, atol=1e-6)
+    free = align_candidates(
+        tiny_prior, old, new, EvidenceMatcher(search=dataclasses.replace(SEARCH, field_weight=0.0)), "free"
+    )
+    assert free.metric is None and free.seen is None
+    assert jnp.isfinite(odds_of(free, SEARCH, "free")).all()
