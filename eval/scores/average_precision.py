@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from jaxtyping import Bool, Float
 
@@ -26,15 +28,30 @@ def average_precision(
         raise ValueError("scores has entries that are not finite; needed finite scores")
     if iou.shape[1] == 0:
         return float("nan")
+    return area(scores, claimed(scores, iou, threshold), iou.shape[1])
+
+
+def area(scores: Float[np.ndarray, " p"], right: Bool[np.ndarray, " p"], count: int) -> float:
+    """The area under the curve of precision over recall of `p` predictions, right or wrong, of `count` instances."""
     if not len(scores):
         return 0.0
-    order = np.lexsort((-iou.max(axis=1), -scores))
-    right = claims(iou[order], threshold)
+    order = np.argsort(-scores, kind="stable")
     last = np.append(np.flatnonzero(np.diff(scores[order])), len(scores) - 1)  # of each distinct score
-    true = np.cumsum(right)[last]
-    recall, precision = true / iou.shape[1], true / (last + 1)
+    true = np.cumsum(right[order])[last]
+    recall, precision = true / count, true / (last + 1)
     best = np.maximum.accumulate(precision[::-1])[::-1]
     return float(np.diff(recall, prepend=0.0) @ best)
+
+
+def claimed(
+    scores: Float[np.ndarray, " p"], iou: Float[np.ndarray, "p g"], threshold: float
+) -> Bool[np.ndarray, " p"]:
+    """Whether each prediction is right, in the order given: `claims`, in that of `average_precision`."""
+    right = np.zeros(len(scores), bool)
+    if iou.size:
+        order = np.lexsort((-iou.max(axis=1), -scores))
+        right[order] = claims(iou[order], threshold)
+    return right
 
 
 def claims(iou: Float[np.ndarray, "p g"], threshold: float) -> Bool[np.ndarray, " p"]:
@@ -46,3 +63,22 @@ def claims(iou: Float[np.ndarray, "p g"], threshold: float) -> Bool[np.ndarray, 
         if free[best] and row[best] >= threshold:
             right[k], free[best] = True, False
     return right
+
+
+def ap_rows(
+    scores: Float[np.ndarray, " p"], iou: Float[np.ndarray, "p g"], thresholds: Sequence[float]
+) -> list[list[float | None]]:
+    """A scene's part of an average precision over several: `[score, right or not at each threshold]` of a prediction,
+    and `[None, 0, …]` of a true instance. Rows of scenes are put together one after the other."""
+    right = np.array([claimed(scores, iou, t) for t in thresholds], float).T
+    predicted = [[float(s), *row.tolist()] for s, row in zip(scores, right, strict=True)]
+    return [*predicted, *([None, *[0.0] * len(thresholds)] for _ in range(iou.shape[1]))]
+
+
+def ap_of_rows(rows: Float[np.ndarray, "n _"]) -> float:
+    """Mean average precision over the thresholds of `ap_rows`, with NaN for None; NaN without true instances."""
+    true = np.isnan(rows[:, 0])
+    if not true.any():
+        return float("nan")
+    scores, right = rows[~true, 0], rows[~true, 1:] > 0
+    return float(np.mean([area(scores, column, int(true.sum())) for column in right.T]))
