@@ -23,6 +23,8 @@ from eval.data.flyingshape import flyingshape
 from eval.data.masks import DAMAGES, with_masks
 from eval.data.truth import KnownScene
 from eval.harness.options import Masks
+from eval.harness.plots import draw_reliability
+from eval.scores.reliability import Bin, calibration_error, reliability
 from more2_jax.config import EvidenceMatcher, SceneConfig, preset
 from more2_jax.matching.assignment import NEVER, assign
 from more2_jax.matching.calibration import FREE, UNASKED, UNKNOWN, UPRIGHT, Calibration, features, weighed
@@ -67,6 +69,7 @@ def main(
     visits: int = 2,
     scenes: int = 0,
     masks: tuple[Masks, ...] = ("true",),
+    out: Path | None = None,
 ) -> None:
     """Fits the log odds of pairs of scans (first and every later one) and says how well they hold.
 
@@ -76,6 +79,7 @@ def main(
         visits: scans of a room that take part, from the first; 0 for all.
         scenes: rooms of a folder, from the first; 0 for all.
         masks: true, or damaged on purpose; every room is seen through each of them.
+        out: folder of the reliability curves, reliability.png and .svg; needs matplotlib.
     """
     rooms = [flyingshape(folder) for folder in data]
     if len({r.upright for r in rooms}) != 1:
@@ -92,6 +96,11 @@ def main(
     if not pairs:
         raise ValueError(f"{', '.join(map(str, data))}: no room with two scans; needed one")
     report(pairs, asked(config), config)
+    curves = reliability_curves(pairs, asked(config))
+    Console(width=120).print(*(reliability_table(name, curve) for name, curve in curves.items()))
+    if out is not None:
+        out.mkdir(parents=True, exist_ok=True)
+        draw_reliability(out / "reliability", curves)
 
 
 def asked(config: SceneConfig) -> dict[str, Calibration]:
@@ -185,14 +194,6 @@ def log_loss(odds: Float[np.ndarray, " p"], one: Bool[np.ndarray, " p"]) -> floa
     return float(np.logaddexp(0.0, np.where(one, -odds, odds)).mean())
 
 
-def calibration_error(odds: Float[np.ndarray, " p"], one: Bool[np.ndarray, " p"], bins: int = 10) -> float:
-    """Expected calibration error: mean difference of what is said and what is true, over equal bins of probability."""
-    said = expit(odds)
-    in_bin = np.minimum((said * bins).astype(int), bins - 1)
-    off = [abs(said[in_bin == k].sum() - one[in_bin == k].sum()) for k in range(bins)]
-    return float(sum(off) / len(said))
-
-
 def report(pairs: Sequence[ScanPair], named: dict[str, Calibration], config: SceneConfig) -> None:
     """Prints the fitted weights and how well the shipped and the fitted ones tell who is who."""
     console = Console(width=120)
@@ -232,6 +233,28 @@ def add_row(
     fewer = counts(thinned(odds, pairs))
     shares = [f"{100 * x:.1f} %" for x in (*whole[:2], *fewer)]
     table.add_row(name, added, f"{log_loss(told, one):.3f}", f"{calibration_error(told, one):.3f}", *shares)
+
+
+def reliability_curves(pairs: Sequence[ScanPair], named: dict[str, Calibration]) -> dict[str, list[Bin]]:
+    """What the shipped and the fitted weights say of candidate pairs, and what is true, by bins of what is said."""
+    one = np.concatenate([p.one[p.among] for p in pairs])
+    curves = {}
+    for name, shipped in named.items():
+        weights = {f"{name}, shipped": {p.room: shipped for p in pairs}}
+        if len({p.room for p in pairs}) > 1:
+            weights[f"{name}, fitted, rooms left out in turn"] = left_out(pairs, shipped)
+        for label, by_room in weights.items():
+            told = [p.odds(by_room[p.room])[p.among] - by_room[p.room].raised for p in pairs]
+            curves[label] = reliability(np.concatenate(told), one)
+    return curves
+
+
+def reliability_table(name: str, curve: Sequence[Bin]) -> Table:
+    """A line a bin."""
+    table = Table("probability", "said", "true", "pairs", title=name)
+    for b in curve:
+        table.add_row(f"{b.low:.1f} to {b.high:.1f}", f"{b.said:.3f}", f"{b.true:.3f}", str(b.count))
+    return table
 
 
 def thinned(

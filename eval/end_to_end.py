@@ -24,12 +24,15 @@ from eval.harness.runs import run_scenes, start_run
 from eval.peers.end_to_end import NAME, combined
 from eval.scores.divided_masks import with_divided_masks
 from eval.scores.figures import Figure, Record, in_columns
+from eval.scores.temporal_ap import temporal_records
 from eval.scores.tracks import Track, changes_f1, score_tracks, tracks_of
 from more2_jax.config import SceneConfig
 from more2_jax.network.prior import Prior
 from more2_jax.scene import add_scan, reconstruct, start_scene
 from more2_jax.types import LivingScene
 from train.run.program import run
+
+TEMPORAL = {"t-mAP": "t_map", "t-AP50": "t_ap50", "AP50, scans pooled": "ap50"}  # docs/evaluation.md
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,6 +53,7 @@ def figures() -> list[Figure]:
         *in_columns(replace(share, name="MRR", key="mrr")),
         replace(error, column="strict", better="lower"),
         replace(share, name="added and removed, F1", key="changes_f1", statistic="mean"),
+        *(replace(share, name=n, key=k, statistic="average_precision") for n, k in TEMPORAL.items()),
         Figure(name="time a scene", key="seconds", statistic="median", unit="s", better="lower"),
     ]
 
@@ -119,9 +123,11 @@ def records_of(
     else:
         reason = ""
     seconds = time.perf_counter() - began
+    followed = temporal_records(scene, tracks)
     scene, tracks = with_divided_masks(scene, tracks)
     pairs = score_tracks(scene, tracks, right_deg, samples)
     whole: Record = {"seconds": seconds, "changes_f1": changes_f1(scene, tracks), "reason": reason}
+    whole |= followed
     return [{"method": name, **r} for r in [*pairs, whole]]
 
 

@@ -11,9 +11,10 @@ import numpy as np
 
 from eval.data.masks import LOST
 from eval.data.truth import Benchmark, KnownObject, KnownScene
-from more2_jax.geometry.poses import Pose
+from more2_jax.geometry.poses import Points, Pose
 from more2_jax.scans.files.json_file import read_json
 from more2_jax.scans.files.npz import read_arrays
+from more2_jax.scans.files.ply_cloud import read_ply
 from more2_jax.types import Instance, Mesh, Scan
 from train.furniture.symmetry import SymmetryGroup, measure
 from train.rooms.scene_files import read_scene
@@ -61,7 +62,31 @@ def read_open(folder: Path) -> KnownScene:
     """One scene with the truth."""
     scene = read_scene(folder)
     objects = tuple(known(o, scene.T_scan_room) for o in scene.objects if o.instance)
-    return KnownScene(name=folder.name, scans=scene.scans, objects=objects, facts={"regime": scene.regime})
+    return KnownScene(
+        name=folder.name,
+        scans=scene.scans,
+        objects=objects,
+        facts={"regime": scene.regime},
+        true_points=tuple(vertices_of(k, scan, objects) for k, scan in enumerate(scene.scans))
+        if scene.regime == "real"
+        else (),
+    )
+
+
+def vertices_of(k: int, scan: Scan, objects: Sequence[KnownObject]) -> dict[str, Points]:
+    """The vertices of each object that scan `k` shows, by its name, as the file beside the scan has them.
+
+    Raises ValueError, in one line, where that file is missing or does not fit the scan.
+    """
+    file = Path(scan.source)
+    points = read_ply(file).points
+    arrays, has = read_arrays(file.with_suffix(".truth.npz"), ("owner", "object"))
+    if len(arrays) < 2 or len(arrays["owner"]) != len(points):
+        raise ValueError(
+            f"{file}: {len(points)} vertices, truth {has}; needed owner (one a vertex) and object"
+        )
+    row = {name: n for n, name in enumerate(arrays["object"].tolist())}
+    return {o.name: points[arrays["owner"] == row[o.name]] for o in objects if k in o.instance}
 
 
 def known(o: TrueObject, T_scan_room: Sequence[Pose] = ()) -> KnownObject:

@@ -39,7 +39,7 @@ def associated(scene: KnownScene, scans: Sequence[Scan]) -> KnownScene:
         dataclasses.replace(o, instance={k: shown[k].get(i, LOST) for k, i in o.instance.items()}, parts={})
         for o in scene.objects
     )
-    return dataclasses.replace(scene, scans=tuple(scans), objects=objects)
+    return dataclasses.replace(scene, scans=tuple(scans), objects=objects, true_points=scene.true_masks())
 
 
 def best_masks(true: Scan, masks: Scan) -> dict[int, int]:

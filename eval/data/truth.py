@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from more2_jax.geometry.poses import Pose
+from more2_jax.geometry.poses import Points, Pose
 from more2_jax.types import Instance, Mesh, Scan
 from train.furniture.symmetry import SymmetryGroup
 
@@ -61,6 +61,27 @@ class KnownScene:
     scans: tuple[Scan, ...]
     objects: tuple[KnownObject, ...]
     facts: dict[str, Any] = field(default_factory=dict)
+    # By scan, the points that are really each object's, by its name; (): those of its masks. None: not known.
+    true_points: tuple[dict[str, Points], ...] | None = ()
+
+    def true_masks(self) -> tuple[dict[str, Points], ...] | None:
+        """By scan, the points that are really each object's, by its name; in the scan's frame, meters.
+
+        None where a scan has instances that belong to no known object: nobody knows what those are.
+        """
+        if self.true_points != ():
+            return self.true_points
+        scans = range(len(self.scans))
+        if any(self.owner(k, i.id) is None for k in scans for i in self.scans[k].instances):
+            return None
+        return tuple(
+            {
+                o.name: np.concatenate([self.instance(k, i).points for i in o.masks(k)])
+                for o in self.objects
+                if k in o.instance
+            }
+            for k in scans
+        )
 
     def first_scans(self, count: int) -> KnownScene:
         """The scene as if only its first scans had been made; 0 for all."""
@@ -74,7 +95,12 @@ class KnownScene:
             )
             for o in self.objects
         ]
-        return replace(self, scans=self.scans[:count], objects=tuple(o for o in objects if o.instance))
+        return replace(
+            self,
+            scans=self.scans[:count],
+            objects=tuple(o for o in objects if o.instance),
+            true_points=self.true_points and self.true_points[:count],
+        )
 
     def owner(self, scan: int, instance: int) -> KnownObject | None:
         """The object that an instance of a scan shows, be it the smaller part of a split one."""

@@ -1,4 +1,4 @@
-"""Plots of a run, each as PNG and SVG: distributions of errors, and what every further scan adds."""
+"""Plots, each as PNG and SVG: distributions of errors, whether probabilities hold, what every further scan adds."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from scipy import stats
 
 from eval.harness.extra import library
 from eval.scores.figures import Record, Row
+from eval.scores.reliability import Bin
 
 ENDINGS = ("png", "svg")
 
@@ -48,6 +49,24 @@ def draw_ecdf(
         share = [0.0, *cdf.probabilities]
         axes.step([0, *cdf.quantiles, limit], [*share, share[-1]], where="post", label=f"{name} ({len(own)})")
     axes.set(xlabel=label, ylabel="share", xlim=(0, limit), ylim=(0, 1))
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize=7)
+    return save(figure, path)
+
+
+def draw_reliability(path: Path, curves: Mapping[str, Sequence[Bin]]) -> list[Path]:
+    """Share that is true over the probability said, a line a curve, and below how many were said so."""
+    figure, (axes, below) = pyplot().subplots(
+        2, 1, figsize=(4.2, 5.2), sharex=True, height_ratios=(3, 1), layout="constrained"
+    )
+    axes.plot([0, 1], [0, 1], color="gray", linestyle=":", label="as said")
+    for name, curve in curves.items():
+        said, count = [b.said for b in curve], [b.count for b in curve]
+        (line,) = axes.plot(said, [b.true for b in curve], marker="o", label=f"{name} ({sum(count)})")
+        low, wide = [b.low for b in curve], [b.high - b.low for b in curve]
+        below.bar(low, count, wide, align="edge", alpha=0.3, color=line.get_color())
+    axes.set(ylabel="share that is true", xlim=(0, 1), ylim=(0, 1))
+    below.set(xlabel="probability said", ylabel="pairs", yscale="log")
     axes.grid(alpha=0.3)
     axes.legend(fontsize=7)
     return save(figure, path)

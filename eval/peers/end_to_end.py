@@ -8,7 +8,7 @@ import numpy as np
 
 from eval.peers.matching import by_registration
 from eval.peers.reconstruction import ball_pivoting
-from eval.peers.registration import many_starts
+from eval.peers.registration import TRUNCATED, best_fit, starts
 from eval.scores.tracks import Track
 from more2_jax.geometry.poses import apply_pose
 from more2_jax.types import Instance, Scan
@@ -31,9 +31,9 @@ def combined(scans: Sequence[Scan], upright: bool) -> list[Track]:
         matched = match(old, new) if old and new else {}
         by_id = {i.id: i for i in new}
         for n, id_ in matched.items():
-            T = many_starts(by_id[id_].points, old[n].points, upright)
-            if T is not None:
-                tracks[n] = extended(tracks[n], k, by_id.pop(id_), T)
+            found = best_fit(by_id[id_].points, old[n].points, starts(upright))
+            if found is not None:
+                tracks[n] = extended(tracks[n], k, by_id.pop(id_), *found)
         tracks += [begun(k, i) for i in by_id.values()]
     return [Track(**{**vars(t), "mesh": ball_pivoting(t.points)}) for t in tracks]
 
@@ -43,10 +43,11 @@ def begun(scan: int, i: Instance) -> Track:
     return Track(instance={scan: i.id}, T_track_scan={scan: np.eye(4)}, points=i.points)
 
 
-def extended(t: Track, scan: int, i: Instance, T: np.ndarray) -> Track:
-    """The object with one more observation."""
+def extended(t: Track, scan: int, i: Instance, T: np.ndarray, apart: float) -> Track:
+    """The object with one more observation, as sure as the clouds lie on one another: `apart` of the diagonal."""
     return Track(
         instance={**t.instance, scan: i.id},
         T_track_scan={**t.T_track_scan, scan: T},
         points=np.concatenate([t.points, apply_pose(T, i.points)]),
+        score=min(t.score, 1 - apart / TRUNCATED),
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections import Counter
 from collections.abc import Sequence
 
 import numpy as np
@@ -22,8 +23,10 @@ def with_divided_masks(scene: KnownScene, tracks: Sequence[Track]) -> tuple[Know
     """
     tracks = list(tracks)
     for scan in range(len(scene.scans)):
-        for mask in sorted({t.instance[scan] for t in tracks if scan in t.halves}):
-            rows = [n for n, t in enumerate(tracks) if scan in t.halves and t.instance[scan] == mask]
+        for mask, held in sorted(Counter(t.instance[scan] for t in tracks if scan in t.instance).items()):
+            if held == 1:
+                continue
+            rows = [n for n, t in enumerate(tracks) if t.instance.get(scan) == mask]
             hidden = [o for o in scene.objects if o.shared.get(scan) == mask and o.instance.get(scan) == LOST]
             owner = scene.owner(scan, mask)
             if owner is not None:
@@ -41,11 +44,11 @@ def _divided(
     hidden: Sequence[KnownObject],
 ) -> tuple[KnownScene, list[Track]]:
     """One mask: its owner's half is the one that lies nearest to it; other halves get new ids."""
-    own = min(rows, key=lambda n: distance_m(tracks[n].halves[scan], owner, scan))
+    own = min(rows, key=lambda n: distance_m(tracks[n].seen[scan], owner, scan))
     whole, instances = scene.instance(scan, mask), list(scene.scans[scan].instances)
     objects, given = list(scene.objects), set[str]()
     for n in rows:
-        half = tracks[n].halves[scan]
+        half = tracks[n].seen[scan]
         id_ = mask if n == own else 1 + max(i.id for i in instances)
         part = dataclasses.replace(whole, id=id_, points=half, colors=None, normals=None)
         instances = [i for i in instances if i.id != id_] + [part]

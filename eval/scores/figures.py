@@ -10,6 +10,8 @@ import numpy as np
 from jaxtyping import Float
 from scipy import stats
 
+from eval.scores.average_precision import ap_of_rows
+
 Record = dict[str, Any]  # one pair, object or scan pair; None stands for a failure
 Column = Literal["paper", "published", "strict", ""]
 COLUMNS: tuple[Column, ...] = ("paper", "published", "strict")
@@ -25,11 +27,12 @@ class Figure:
     `at_least`: of all records, those with `key` at `limit` or more; a failure is not.
     `mean`: of the records that have a value. `median`: of all; a failure is worse than any value.
     `ratio`: the sum of `key` over the sum of `over`.
+    `average_precision`: of the predictions of all scenes together; `key` holds the `ap_rows` of one.
     """
 
     name: str
     key: str
-    statistic: Literal["share", "at_least", "mean", "median", "ratio"]
+    statistic: Literal["share", "at_least", "mean", "median", "ratio", "average_precision"]
     column: Column = ""
     unit: str = ""
     better: Literal["higher", "lower"] = "higher"
@@ -70,14 +73,15 @@ def figure_row(
         return None
     pooled = np.concatenate(arrays)
     value = reduce(figure, pooled)
-    failures = int(np.isnan(pooled[:, 0]).sum())
+    without = int(np.isnan(pooled[:, 0]).sum())
+    counts = {"ratio": int(pooled[:, 1].sum()), "average_precision": without}
     return Row(
         name=figure.name,
         value=value * figure.scale if np.isfinite(value) else None,
         unit=figure.unit,
         better=figure.better,
-        count=int(pooled[:, 1].sum()) if figure.statistic == "ratio" else len(pooled),
-        failures=failures,
+        count=counts.get(figure.statistic, len(pooled)),
+        failures=0 if figure.statistic == "average_precision" else without,
         ci95=interval(figure, arrays),
         method=method,
         column=figure.column,
@@ -87,8 +91,10 @@ def figure_row(
 
 
 def values_of(figure: Figure, records: Sequence[Record]) -> np.ndarray:
-    """(n, 2): the value (NaN: failure) and, of a ratio, what it is divided by."""
+    """(n, 2): the value (NaN: failure) and, of a ratio, what it is divided by. Of an average precision: `ap_rows`."""
     kept = [r for r in records if figure.key in r]
+    if figure.statistic == "average_precision":
+        return np.array([row for r in kept for row in r[figure.key]], float)
     if figure.successes:
         key, limit = figure.successes
         kept = [r for r in kept if r[key] is not None and r[key] < limit]
@@ -114,6 +120,8 @@ def parts(figure: Figure, rows: np.ndarray) -> tuple[float, float]:
 
 def reduce(figure: Figure, rows: np.ndarray) -> float:
     """The statistic of pooled rows; NaN of nothing."""
+    if figure.statistic == "average_precision":
+        return ap_of_rows(rows)
     if figure.statistic == "median":
         return _median(rows[:, 0], worst=np.inf if figure.better == "lower" else -np.inf)
     above, below = parts(figure, rows)
@@ -132,7 +140,7 @@ def interval(figure: Figure, arrays: Sequence[np.ndarray]) -> tuple[float, float
     if len(arrays) < 2:
         return None
     index = np.random.default_rng(0).integers(0, len(arrays), (DRAWS, len(arrays)))
-    if figure.statistic == "median":
+    if figure.statistic in ("median", "average_precision"):
         draws = np.array([reduce(figure, np.concatenate([arrays[k] for k in row])) for row in index])
     else:
         above, below = np.array([parts(figure, a) for a in arrays]).T

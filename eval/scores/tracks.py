@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -26,28 +25,30 @@ class Track:
     T_track_scan: dict[int, Pose]
     points: Float[np.ndarray, "n 3"]
     mesh: Mesh | None = None
-    halves: dict[int, Float[np.ndarray, "n 3"]] = field(
+    score: float = 1.0  # of its least sure match, coming or going; 0 to 1
+    seen: dict[int, Float[np.ndarray, "n 3"]] = field(
         default_factory=dict
-    )  # of masks that hold another track too
+    )  # by scan, its own points, where masks were mended; else those of its instance
 
 
 def tracks_of(scene: LivingScene) -> list[Track]:
     """The objects of a living scene."""
-    masks = Counter((seen.scan, seen.instance) for o in scene.objects for seen in o.observations)
     return [
         Track(
             instance={seen.scan: seen.instance for seen in o.observations},
             T_track_scan={seen.scan: seen.T_ref_scan for seen in o.observations},
             points=accumulated_points(o),
             mesh=o.mesh,
-            halves={
-                seen.scan: points_of(o, seen)
-                for seen in o.observations
-                if masks[seen.scan, seen.instance] > 1
-            },
+            score=min(*(seen.score for seen in o.observations), *came_or_went(scene, o.id), 1.0),
+            seen={seen.scan: points_of(o, seen) for seen in o.observations},
         )
         for o in scene.objects
     ]
+
+
+def came_or_went(scene: LivingScene, id_: str) -> list[float]:
+    """How probable it is that an object came when it is said to have come, and went."""
+    return [c.probability[id_] for c in scene.changes if id_ in c.probability and id_ in c.added + c.removed]
 
 
 def track_with(tracks: Sequence[Track], scan: int, instance: int) -> Track | None:

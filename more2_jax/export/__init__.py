@@ -38,6 +38,10 @@ def export_scene(scene: LivingScene, target: str | Path, format: str, *, scan: i
     - ply: the accumulated points as they lie in `scan`; the vertex property `object` is the object's number.
     - json: poses and changes only, as in the living-scene folder's scene.json; z is up.
 
+    Where a scan did not look at the place of an object (*not seen*), glb and usd show it there, pale, by a node
+    `<id>_not_seen`, and say so a scan (glb: `extras.states`; usd: the attribute `more2:state`: `seen`, `not_seen` or
+    `absent`); ply names its number in a comment; json has `scans[].not_seen` and `changes[].not_seen`.
+
     Raises ValueError for an unknown format or scan, a scan without objects (glb, ply), USD without its extra, or
     a path that would overwrite part of a living scene.
     """

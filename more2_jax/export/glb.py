@@ -13,7 +13,7 @@ from trimesh.exchange.gltf import export_glb
 from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
-from more2_jax.export.placing import Track, placed, quaternions, track
+from more2_jax.export.placing import PALE, State, Track, placed, quaternions, track
 from more2_jax.report import rgb
 from more2_jax.types import LivingScene, SceneObject
 
@@ -28,7 +28,8 @@ Channels = dict[str, tuple[Float[np.ndarray, "scans _"], str]]  # path → value
 def write_glb(scene: LivingScene, path: Path, scan: int) -> None:
     """Objects as nodes under `ROOT`; at rest as in `scan`, in the animation `scans` as in scan t at t seconds.
 
-    An object that is absent has scale 0, in steps: glTF has no other visibility that every viewer knows.
+    An object that is not seen or absent has scale 0, in steps: glTF has no other visibility that every viewer knows.
+    Where a scan did not look, a node of its own, `<id>_not_seen`, shows the object pale at its last place.
     Positions are in the scene's frame, relative to the scene's middle, which `ROOT` holds in double precision.
     """
     T_scene_scan = scene.scans[scan].frame.T_scene_scan
@@ -40,39 +41,48 @@ def write_glb(scene: LivingScene, path: Path, scan: int) -> None:
         frame_from=graph.graph.base_frame, frame_to=ROOT, matrix=T_YUP_ZUP @ np.linalg.inv(T_middle_scan)
     )
     channels: dict[str, Channels] = {}
+    extras: dict[str, dict[str, Any]] = {}
     for k, o in enumerate(scene.objects):
-        node = track(o, len(scene.scans))
-        graph.add_geometry(_shape(o, k, node), node_name=o.id, geom_name=o.id, parent_node_name=ROOT)
-        channels[o.id] = _channels(node, T_middle_scan)
-    labels = {o.id: o.label for o in scene.objects}
-    path.write_bytes(export_glb(graph, buffer_postprocessor=_animator(channels, labels, scan)))
+        node = track(o, scene.scans)
+        for state, name, opacity in (("seen", o.id, 1.0), ("not_seen", f"{o.id}_not_seen", PALE)):
+            if state in node.states:
+                shape = _shape(o, k, node, opacity)
+                graph.add_geometry(shape, node_name=name, geom_name=name, parent_node_name=ROOT)
+                channels[name] = _channels(node, T_middle_scan, state)
+                extras[name] = {"id": o.id, "label": o.label, "states": list(node.states)}
+    path.write_bytes(export_glb(graph, buffer_postprocessor=_animator(channels, extras, scan)))
 
 
-def _shape(o: SceneObject, number: int, node: Track) -> trimesh.PointCloud | trimesh.Trimesh:
-    paint = [*rgb(number), 255]
+def _shape(o: SceneObject, number: int, node: Track, opacity: float) -> trimesh.PointCloud | trimesh.Trimesh:
+    paint = [*rgb(number), round(255 * opacity)]
     if o.mesh is None:
         return trimesh.PointCloud(node.vertices, colors=np.tile(paint, (len(node.vertices), 1)))
     shape = trimesh.Trimesh(node.vertices, o.mesh.faces, process=False)
     shape.visual = TextureVisuals(
         material=PBRMaterial(
-            name=o.id, baseColorFactor=paint, metallicFactor=0.0, roughnessFactor=0.8, doubleSided=True
+            name=o.id,
+            baseColorFactor=paint,
+            metallicFactor=0.0,
+            roughnessFactor=0.8,
+            doubleSided=True,
+            alphaMode=None if opacity == 1 else "BLEND",
         )
     )
     return shape
 
 
-def _channels(node: Track, T_middle_scan: Float[np.ndarray, "4 4"]) -> Channels:
-    """What the node does at every scan."""
-    poses = T_middle_scan @ node.T_scene_node
+def _channels(node: Track, T_middle_scan: Float[np.ndarray, "4 4"], state: State) -> Channels:
+    """What the node that shows an object in one state does at every scan."""
+    poses = T_middle_scan @ node.poses(state)
     return {
         "translation": (poses[:, :3, 3], "LINEAR"),
         "rotation": (quaternions(poses), "LINEAR"),
-        "scale": (np.repeat(node.present[:, None].astype(float), 3, axis=1), "STEP"),
+        "scale": (np.repeat(node.shown(state)[:, None].astype(float), 3, axis=1), "STEP"),
     }
 
 
 def _animator(
-    channels: dict[str, Channels], labels: dict[str, str | None], scan: int
+    channels: dict[str, Channels], extras: dict[str, dict[str, Any]], scan: int
 ) -> Callable[[dict[str, bytes], dict[str, Any]], None]:
     """What trimesh calls with its buffers and glTF tree before it packs them: adds poses and the animation."""
 
@@ -84,7 +94,7 @@ def _animator(
             if (name := node.get("name")) not in channels:
                 continue
             node.pop("matrix", None)  # an animated node has translation, rotation, scale instead
-            node["extras"] = {"id": name, "label": labels[name]}
+            node["extras"] = extras[name]
             for path, (values, interpolation) in channels[name].items():
                 node[path] = values[scan].tolist()
                 output = _accessor(buffers, tree, f"{name} {path}", values)

@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
 from more2_jax.tracking.objects import accumulated_points, observation_in, place_of
-from more2_jax.types import LivingScene, SceneObject
+from more2_jax.types import LivingScene, ScanRecord, SceneObject
+
+State = Literal["seen", "not_seen", "absent"]  # of an object in a scan
+PALE = 0.22  # opacity of an object where it stood last, in scans that did not look there; as on the page
 
 
 def pose_in(o: SceneObject, scan: int) -> Float[np.ndarray, "4 4"] | None:
@@ -34,27 +39,46 @@ class Track:
 
     Files hold geometry in single precision; about its own center it keeps its micrometers however far from
     the world's zero it lies. Poses are in the scene's frame, which its scans may not share. Where the object
-    is absent its pose is the last one seen, or the first.
+    is not seen or absent its pose is the last one seen, or the first.
     """
 
     vertices: Float[np.ndarray, "v 3"]  # meters, relative to the node
     T_scene_node: Float[np.ndarray, "scans 4 4"]
-    present: Bool[np.ndarray, " scans"]
+    states: tuple[State, ...]  # one a scan
+
+    def shown(self, state: State) -> Bool[np.ndarray, " scans"]:
+        """In which scans the object is in a state."""
+        return np.array([s == state for s in self.states])
+
+    def poses(self, state: State) -> Float[np.ndarray, "scans 4 4"]:
+        """T_scene_node of the node that shows this state; what shows where an object was does not glide away."""
+        if state == "seen":
+            return self.T_scene_node
+        held = self.T_scene_node[0]
+        shown = zip(self.T_scene_node, self.shown(state), strict=True)
+        return np.stack([held := T if there else held for T, there in shown])
 
 
-def track(o: SceneObject, scans: int) -> Track:
+def state_in(o: SceneObject, scan: ScanRecord) -> State:
+    """Whether a scan shows an object, did not look where it stood last, or looked and has none of it."""
+    if observation_in(o, scan.index) is not None:
+        return "seen"
+    return "not_seen" if o.id in scan.not_seen else "absent"
+
+
+def track(o: SceneObject, scans: Sequence[ScanRecord]) -> Track:
     """The node of one object over all scans: its mesh, or its accumulated points without one."""
     vertices = accumulated_points(o) if o.mesh is None else o.mesh.vertices
     T_ref_node = np.eye(4)
     T_ref_node[:3, 3] = vertices.mean(axis=0)
-    seen = [observation_in(o, s) for s in range(scans)]
+    seen = [observation_in(o, s.index) for s in scans]
     poses = [None if s is None else place_of(s) for s in seen]
     held = next(T for T in poses if T is not None)
     filled = [held := held if T is None else T for T in poses]
     return Track(
         vertices=vertices - T_ref_node[:3, 3],
         T_scene_node=np.stack([T @ T_ref_node for T in filled]),
-        present=np.array([T is not None for T in poses]),
+        states=tuple(state_in(o, s) for s in scans),
     )
 
 

@@ -7,9 +7,9 @@ from types import ModuleType
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
-from more2_jax.export.placing import quaternions, track
+from more2_jax.export.placing import PALE, Track, quaternions, track
 from more2_jax.report import rgb
 from more2_jax.types import LivingScene, SceneObject
 
@@ -32,23 +32,25 @@ def write_usd(scene: LivingScene, path: Path, scan: int) -> None:
     root = pxr.UsdGeom.Xform.Define(stage, "/scene")
     stage.SetDefaultPrim(root.GetPrim())
     for k, o in enumerate(scene.objects):
-        node = track(o, len(scene.scans))
-        _add_node(pxr, stage, o, node.T_scene_node, node.present)
+        node = track(o, scene.scans)
+        prim = _add_node(pxr, stage, o.id, node.poses("seen"), node.shown("seen"))
+        _describe(pxr, prim, o, node)
         _add_shape(pxr, stage, o, node.vertices, rgb(k))
+        if (unseen := node.shown("not_seen")).any():
+            _add_node(pxr, stage, f"{o.id}_not_seen", node.poses("not_seen"), unseen)
+            _add_pale(pxr, stage, o)
     stage.GetRootLayer().Save()
 
 
 def _add_node(
     pxr: ModuleType,
     stage: Any,
-    o: SceneObject,
+    name: str,
     poses: Float[np.ndarray, "scans 4 4"],
-    present: np.ndarray,
-) -> None:
+    present: Bool[np.ndarray, " scans"],
+) -> Any:
     """Translation and quaternion, not a matrix: between samples a matrix would be sheared."""
-    node = pxr.UsdGeom.Xform.Define(stage, f"/scene/{o.id}")
-    if o.label is not None:
-        node.GetPrim().SetCustomDataByKey("label", o.label)
+    node = pxr.UsdGeom.Xform.Define(stage, f"/scene/{name}")
     double = pxr.UsdGeom.XformOp.PrecisionDouble
     translate, orient = node.AddTranslateOp(double), node.AddOrientOp(double)
     visible = node.CreateVisibilityAttr()
@@ -56,6 +58,23 @@ def _add_node(
         translate.Set(pxr.Gf.Vec3d(*T[:3, 3].tolist()), s)
         orient.Set(pxr.Gf.Quatd(w, x, y, z), s)
         visible.Set("inherited" if present[s] else "invisible", s)
+    return node.GetPrim()
+
+
+def _describe(pxr: ModuleType, prim: Any, o: SceneObject, node: Track) -> None:
+    """The object's label, and its state at every scan: `seen`, `not_seen` or `absent`."""
+    if o.label is not None:
+        prim.SetCustomDataByKey("label", o.label)
+    told = prim.CreateAttribute("more2:state", pxr.Sdf.ValueTypeNames.Token)
+    for s, state in enumerate(node.states):
+        told.Set(state, s)
+
+
+def _add_pale(pxr: ModuleType, stage: Any, o: SceneObject) -> None:
+    """The object's shape once more, pale."""
+    shape = stage.DefinePrim(f"/scene/{o.id}_not_seen/shape")
+    shape.GetReferences().AddInternalReference(f"/scene/{o.id}/shape")
+    pxr.UsdGeom.Gprim(shape).CreateDisplayOpacityAttr([PALE])
 
 
 def _add_shape(
@@ -82,6 +101,7 @@ def _add_shape(
 def _pxr() -> ModuleType:
     try:
         import pxr.Gf
+        import pxr.Sdf
         import pxr.Usd
         import pxr.UsdGeom
     except ImportError as error:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -28,12 +29,16 @@ def write_points(
     scan: Int[np.ndarray, " n"],
     name: str = "scan",
     normals: Float[np.ndarray, "n 3"] | None = None,
+    comments: Sequence[str] = (),
 ) -> None:
-    """Writes a cloud in meters, with its normals if it has any; each point's integer is the vertex property `name`."""
+    """Writes a cloud in meters, with its normals if it has any; each point's integer is the vertex property `name`.
+
+    `comments` are lines of the header, in ASCII.
+    """
     columns = {name: np.asarray(scan, "<i4")}
     if normals is not None:
         columns |= {axis: np.asarray(normals, "<f8")[:, i] for i, axis in enumerate(NORMAL)}
-    PlyData([_vertices(points, **columns)], byte_order="<").write(str(path))
+    PlyData([_vertices(points, **columns)], byte_order="<", comments=list(comments)).write(str(path))
 
 
 def read_points(

@@ -11,7 +11,6 @@ from scipy.special import expit
 
 from eval.calibration import (
     ScanPair,
-    calibration_error,
     counts,
     fitted,
     labels,
@@ -19,9 +18,12 @@ from eval.calibration import (
     log_loss,
     main,
     most,
+    reliability_curves,
+    reliability_table,
     scan_pairs,
     thinned,
 )
+from eval.scores.reliability import Bin, reliability
 from more2_jax.config import preset
 from more2_jax.matching.calibration import FREE, UNASKED, UPRIGHT, Calibration
 from more2_jax.matching.candidates import align_candidates, odds_of
@@ -81,15 +83,6 @@ def test_colors_are_evidence_with_a_weight_of_their_own():
     assert found.intercept == pytest.approx(PLANTED.intercept, abs=0.35)
 
 
-def test_calibration_error_by_hand():
-    odds = np.log(np.array([0.9, 0.9, 0.9, 0.9, 0.25, 0.25]) / np.array([0.1, 0.1, 0.1, 0.1, 0.75, 0.75]))
-    one = np.array([True, True, True, False, False, True])
-    assert calibration_error(odds, one) == pytest.approx((4 * 0.15 + 2 * 0.25) / 6)
-    rng = np.random.default_rng(0)
-    many = rng.normal(scale=3, size=50_000)
-    assert calibration_error(many, rng.random(50_000) < expit(many)) < 0.01
-
-
 def test_log_loss_by_definition_and_where_odds_are_large():
     odds, one = np.array([0.3, -2.0, 800.0]), np.array([True, False, False])
     assert log_loss(odds[:2], one[:2]) == pytest.approx(-np.log(expit(0.3) * (1 - expit(-2.0))) / 2)
@@ -139,6 +132,41 @@ def test_pairs_are_weighed_as_the_package_weighs_them(tiny_prior):
         aligned = align_candidates(tiny_prior, sides[0], sides[b], matcher, "upright")
         odds = odds_of(aligned, search, "upright")
         np.testing.assert_allclose(pair.odds(UPRIGHT), odds, rtol=1e-3, atol=1e-3)
+
+
+def test_curves_are_of_every_candidate_by_weights_that_did_not_see_its_room():
+    pairs = [drawn(room, 3000, k) for k, room in enumerate("abc")]
+    apart = dataclasses.replace(PLANTED, intercept=PLANTED.intercept + 1.5)
+    curves = reliability_curves(pairs, {"P": apart})
+    assert list(curves) == ["P, shipped", "P, fitted, rooms left out in turn"]
+    shipped, fitted_ = curves.values()
+    assert sum(b.count for b in shipped) == sum(b.count for b in fitted_) == 9000
+    assert all(b.said > b.true for b in shipped if b.count > 300)  # odds 1.5 too high
+    assert all(abs(b.said - b.true) < 0.06 for b in fitted_ if b.count > 300)
+    assert list(reliability_curves(pairs[:1], {"P": apart})) == ["P, shipped"]  # one room leaves no other
+    raised = dataclasses.replace(apart, intercept=apart.intercept + 2, raised=2.0)  # raised odds say the same
+    for one, other in zip(
+        reliability_curves(pairs[:1], {"P": raised})["P, shipped"], curves_of(pairs[0], apart), strict=True
+    ):
+        assert one.count == other.count and one.said == pytest.approx(other.said)
+
+
+def curves_of(pair: ScanPair, c: Calibration):
+    return reliability(pair.odds(c)[0], pair.one[0])
+
+
+def test_a_line_a_bin():
+    bins = [
+        Bin(low=0.0, high=0.1, said=0.05, true=0.25, count=8),
+        Bin(low=0.9, high=1.0, said=0.95, true=1.0, count=2),
+    ]
+    table = reliability_table("name", bins)
+    assert [list(c.cells) for c in table.columns] == [
+        ["0.0 to 0.1", "0.9 to 1.0"],
+        ["0.050", "0.950"],
+        ["0.250", "1.000"],
+        ["8", "2"],
+    ]
 
 
 def test_rooms_of_two_kinds_are_refused(tmp_path, monkeypatch):

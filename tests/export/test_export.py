@@ -8,8 +8,8 @@ import jsonschema
 import numpy as np
 import pytest
 import trimesh
-from export_readers import Z_UP_OF_Y_UP, Gltf, placed, seen_in
-from factories import living_scene, scene_object
+from export_readers import Z_UP_OF_Y_UP, Gltf, placed, seen_in, usd_shown
+from factories import WORLD_M, living_scene, scene_object, turn_z
 from plyfile import PlyData
 from scipy.spatial.transform import Rotation
 
@@ -47,7 +47,8 @@ def test_glb_has_a_keyframe_a_scan_and_objects_vanish_in_steps(tmp_path):
         np.testing.assert_allclose(np.linalg.norm(channels["rotation"][1], axis=1), 1, atol=1e-6)
         node = gltf.file.nodes[gltf.nodes[o.id]]
         assert node.matrix is None  # the standard forbids one on animated nodes
-        assert node.extras == {"id": o.id, "label": o.label}
+        states = ["absent" if seen_in(o, s) is None else "seen" for s in range(3)]
+        assert node.extras == {"id": o.id, "label": o.label, "states": states}
 
 
 def test_glb_turns_the_short_way_between_scans(tmp_path):
@@ -214,6 +215,81 @@ def test_exporting_usd_twice_replaces_the_file(tmp_path):
     pytest.importorskip("pxr.Usd")
     first = export_scene(SCENE, tmp_path, "usd").read_bytes()
     assert export_scene(SCENE, tmp_path, "usd").read_bytes() == first
+
+
+# --- what a scan did not look at --------------------------------------------------------------------------------
+
+
+def unseen_scene() -> LivingScene:
+    """On tuesday objects 2 and 4 are missing; tuesday did not look where 2 stood. On friday it is elsewhere."""
+    moved = turn_z(np.deg2rad(30), WORLD_M + [6.0, 0, 0], np.array([0.0, 5.0, 0.0]))
+    monday, tuesday, friday = SCENE.scans
+    scans = (monday, dataclasses.replace(tuesday, not_seen=("object_002",)), friday)
+    again = scene_object(2, {0: np.eye(4), 2: moved})
+    first = dataclasses.replace(SCENE.changes[0], removed=("object_004",), not_seen=("object_002",))
+    objects = (*SCENE.objects[:2], again, *SCENE.objects[3:])
+    return dataclasses.replace(SCENE, scans=scans, objects=objects, changes=(first, SCENE.changes[1]))
+
+
+UNSEEN = unseen_scene()
+STATES = {
+    "object_000": ["seen", "seen", "seen"],
+    "object_002": ["seen", "not_seen", "seen"],
+    "object_003": ["absent", "seen", "seen"],
+    "object_004": ["seen", "absent", "seen"],
+}
+
+
+def test_glb_shows_what_is_not_seen_pale_where_it_stood_and_what_is_removed_not_at_all(tmp_path):
+    gltf = Gltf(export_scene(UNSEEN, tmp_path, "glb", scan=1))
+    assert set(gltf.nodes) >= {o.id for o in UNSEEN.objects} | {"object_002_not_seen"}
+    assert [n for n in gltf.nodes if n and n.endswith("_not_seen")] == ["object_002_not_seen"]
+    for name, states in STATES.items():
+        assert gltf.file.nodes[gltf.nodes[name]].extras["states"] == states
+    assert gltf.shown("object_002", 1) is None and gltf.shown("object_004", 1) is None
+    shown = [gltf.shown("object_002_not_seen", s) for s in range(3)]
+    assert shown[0] is None and shown[2] is None
+    np.testing.assert_allclose(shown[1][0], gltf.shown("object_002", 0)[0], atol=1e-4)
+    rest = gltf.file.nodes[gltf.nodes["object_002_not_seen"]]
+    assert rest.scale == [1, 1, 1]  # at rest in that scan
+    pale = gltf.file.materials[gltf.file.meshes[rest.mesh].primitives[0].material]
+    assert pale.alphaMode == "BLEND" and 0.1 < pale.pbrMetallicRoughness.baseColorFactor[3] < 0.4
+    (_, where, _) = gltf.sampled(gltf.nodes["object_002_not_seen"])["translation"]
+    np.testing.assert_array_equal(
+        where[1], where[2]
+    )  # it vanishes, and does not glide to where the object is
+
+
+def test_usd_shows_what_is_not_seen_pale_where_it_stood_and_says_so(tmp_path):
+    pytest.importorskip("pxr.Usd")
+    from pxr import Usd, UsdGeom
+
+    path = export_scene(UNSEEN, tmp_path, "usd")
+    stage = Usd.Stage.Open(str(path))
+    for name, states in STATES.items():
+        told = stage.GetPrimAtPath(f"/scene/{name}").GetAttribute("more2:state")
+        assert [told.Get(s) for s in range(3)] == states
+    assert usd_shown(path, "object_002", 1) is None and usd_shown(path, "object_004", 1) is None
+    pale = [usd_shown(path, "object_002_not_seen", s) for s in range(3)]
+    assert pale[0] is None and pale[2] is None
+    before = usd_shown(path, "object_002", 0)
+    for a, b in zip(pale[1], before, strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-4)
+    shape = UsdGeom.Gprim(stage.GetPrimAtPath("/scene/object_002_not_seen/shape"))
+    assert 0.1 < shape.GetDisplayOpacityAttr().Get()[0] < 0.4
+    assert not stage.GetPrimAtPath("/scene/object_004_not_seen")
+
+
+def test_ply_names_what_the_scan_did_not_look_at(tmp_path):
+    comments = [PlyData.read(str(export_scene(UNSEEN, tmp_path, "ply", scan=s))).comments for s in range(3)]
+    assert comments == [[], ["not seen: object 2"], []]
+
+
+def test_json_tells_what_was_not_seen_from_what_was_removed(tmp_path):
+    content = json.loads(export_scene(UNSEEN, tmp_path, "json").read_text())
+    assert [s.get("not_seen", []) for s in content["scans"]] == [[], ["object_002"], []]
+    (change, _) = content["changes"]
+    assert (change["not_seen"], change["removed"]) == (["object_002"], ["object_004"])
 
 
 # --- what is refused --------------------------------------------------------------------------------------------
