@@ -29,12 +29,14 @@ from rich.progress import (
 from eval.data.flyingshape import digest
 from eval.data.masks import DAMAGES, with_masks
 from eval.data.truth import Benchmark, KnownScene
+from eval.harness.extra import library
 from eval.harness.options import Options, benchmark, is_upright
 from eval.scores.figures import Record
 from more2_jax.config import SceneConfig, preset
 from more2_jax.network.prior import Prior, load_prior
 
 VERSION = 1
+PEER_LIBRARIES = ("open3d", "small_gicp")  # that peers of all programs are made of
 Work = Callable[[Sequence[KnownScene]], Sequence[list[Record]]]  # records of every scene of a chunk
 
 
@@ -61,8 +63,12 @@ class Run:
 def start_run(program: str, o: Options, settings: dict[str, Any]) -> Run:
     """Opens or resumes the run in `o.out`.
 
-    Raises ValueError if that folder holds a run of other settings, weights or data, unless `o.fresh`.
+    Raises ValueError if that folder holds a run of other settings, weights or data, unless `o.fresh`, and if peers are
+    asked for whose libraries cannot be imported.
     """
+    if o.peers:  # a peer that cannot run would count as one that fails on every scene
+        for name in PEER_LIBRARIES:
+            library(name)
     if o.distributed:
         jax.distributed.initialize()
     data, prior = benchmark(o), load_prior(o.prior)

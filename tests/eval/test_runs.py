@@ -181,3 +181,11 @@ def test_all_programs_on_one_scene(tmp_path, tiny_prior):
     )
     page = (tmp_path / "runs" / "results_tables.md").read_text()
     assert all(f"### {report.TITLES[p]}" in page for p in everything.PROGRAMS)
+
+
+def test_peers_that_cannot_run_are_told_before_the_first_scene(options, monkeypatch):
+    monkeypatch.setitem(sys.modules, "open3d", None)  # an import of it fails
+    with pytest.raises(ValueError, match=r"open3d .*install more2-jax\[peers\]"):
+        start_run("test", dataclasses.replace(options, peers=True), {})
+    assert not options.out.exists()
+    start_run("test", options, {})
