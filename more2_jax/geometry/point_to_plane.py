@@ -328,9 +328,15 @@ def align(
     motion: MotionModel,
 ) -> jaxlie.SE3:
     """`steps` of `align_step`, the reach falling geometrically from the first to the second value."""
-    widths = jnp.geomspace(reach[0], reach[1], steps)
+    return align_by(T, source, target, jnp.geomspace(reach[0], reach[1], steps), motion)
 
-    def body(T: jaxlie.SE3, width: Array) -> tuple[jaxlie.SE3, None]:
-        return align_step(T, source, target, width, motion), None
 
-    return jax.lax.scan(body, T, widths)[0]
+def align_by(
+    T: jaxlie.SE3, source: Surface, target: Surface, reaches: Float[Array, " steps"], motion: MotionModel
+) -> jaxlie.SE3:
+    """A step of `align_step` with every reach in turn."""
+
+    def body(T: jaxlie.SE3, reach: Array) -> tuple[jaxlie.SE3, None]:
+        return align_step(T, source, target, reach, motion), None
+
+    return jax.lax.scan(body, T, reaches)[0]

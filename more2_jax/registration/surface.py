@@ -24,6 +24,7 @@ from more2_jax.network.prior import Prior
 from more2_jax.network.row_map import chunked
 from more2_jax.registration.pair_batch import PairBatch
 from more2_jax.registration.pose_costs import (
+    about_as_good,
     field_cost,
     free_space_cost,
     height_cost,
@@ -87,6 +88,8 @@ def _refine_poses(
     ) -> Registration:
         return refine_pair(prior, source, target, candidates, stayed, settings, motion)
 
+    if jax.default_backend() == "cpu":  # one after the other, so that what is not asked of the prior costs nothing
+        return jax.lax.map(lambda pair: one(*pair), pairs)
     return jax.vmap(one)(*pairs)
 
 
@@ -168,13 +171,32 @@ def prior_cost(
     objects: tuple[AlignableObject, AlignableObject],
     settings: SurfaceRegistration,
 ) -> Float[Array, " k"]:
-    """What the prior adds to the costs of poses; nothing where it is not asked."""
+    """What the prior adds to the costs of poses; nothing where it is not asked.
+
+    It is asked in the order of the costs, and not about a pose that fits so much worse than one asked before that it
+    could neither win nor compete if it lay on the completed surfaces exactly; nor if there is no other to choose.
+    """
     weight = settings.search.field_weight
     if not weight:
         return jnp.zeros_like(costs)
-    source, target = (thinned(o.whole, settings.field_points).sampled for o in objects)
-    off = off_fields(prior, poses, (source, target), (objects[0].code, objects[1].code))
-    return field_cost(costs, off.mean(axis=1), weight)
+    clouds = tuple(thinned(o.whole, settings.field_points).sampled for o in objects)
+    codes, near = (objects[0].code, objects[1].code), about_as_good(costs)
+
+    def ask(least: Array, k: Array) -> tuple[Array, Array]:
+        T = jax.tree.map(lambda x: x[k][None], poses)
+        # Twice, as "it did not move" may be chosen by the first, and others compete with it by the second.
+        asked = near[k] & (near.sum() > 1) & (costs[k] <= as_good_as(as_good_as(least)))
+        off = jax.lax.cond(
+            asked,
+            lambda T: off_fields(prior, T, clouds, codes).mean(),  # type: ignore[arg-type]
+            lambda T: jnp.zeros(()),
+            T,
+        )
+        return jnp.where(asked, jnp.minimum(least, costs[k] + weight * off), least), off
+
+    order = jnp.argsort(costs)
+    _, off = jax.lax.scan(ask, jnp.asarray(jnp.inf, costs.dtype), order)
+    return field_cost(costs, jnp.zeros_like(costs).at[order].set(off), weight)
 
 
 def choose(costs: Float[Array, " k"], stayed_is_last: bool, doubt: Float[Array, " k"] | float = 0.0) -> Array:
@@ -186,7 +208,12 @@ def choose(costs: Float[Array, " k"], stayed_is_last: bool, doubt: Float[Array, 
 
 def nearly_as_good(costs: Float[Array, " k"], best: Array) -> Bool[Array, " k"]:
     """Which poses explain the clouds about as well as the best."""
-    return costs <= costs[best] * STAYED_RATIO + STAYED_OFFSET
+    return costs <= as_good_as(costs[best])
+
+
+def as_good_as(cost: Float[Array, ""]) -> Float[Array, ""]:
+    """The highest cost that counts as nearly as good."""
+    return cost * STAYED_RATIO + STAYED_OFFSET
 
 
 def polished(
@@ -201,7 +228,7 @@ def polished(
     reach = (settings.last_reach, settings.polish_reach)
     finer = align(T, source, target, reach, settings.polish_steps, motion)
     fit = misfit(finer, source, target, truncations(settings))
-    return jax.tree.map(lambda x, y: jnp.where(fit <= before * STAYED_RATIO + STAYED_OFFSET, x, y), finer, T)
+    return jax.tree.map(lambda x, y: jnp.where(fit <= as_good_as(before), x, y), finer, T)
 
 
 def scored(
