@@ -92,7 +92,9 @@ def nearest_index(
 
     def nearer(best: Int[Array, " n"], some: tuple[Array, Array, Array]) -> tuple[Int[Array, " n"], None]:
         points, real, row = some
-        squared = sum((a[None, :, i] - points[:, None, i]).astype(jnp.float32) ** 2 for i in range(a.shape[1]))
+        squared = sum(
+            (a[None, :, i] - points[:, None, i]).astype(jnp.float32) ** 2 for i in range(a.shape[1])
+        )
         key = (jax.lax.bitcast_convert_type(squared, jnp.int32) & ~low) | row[:, None]
         return jnp.minimum(best, jnp.where(real[:, None], key, last).min(axis=0)), None
 

@@ -83,7 +83,7 @@ def _off_completed_surfaces(
         order = order.at[:LEADING].set(lead[jnp.argsort(exact_cost[lead])])
         return jax.tree.map(lambda x: x[order], (found, off))
 
-    return jax.lax.map(one, pairs)
+    return jax.lax.map(one, pairs, batch_size=None if jax.default_backend() == "cpu" else 8)
 
 
 def every_nth(cloud: Sampled, n: int) -> Sampled:

@@ -28,7 +28,8 @@ from more2_jax.registration.pose_costs import (
 from more2_jax.registration.starting_poses import candidate_poses, masked_mean
 from more2_jax.types import AnyArray, Embedding, LocalBatch, Sight, pytree, quantity
 
-OBJECTS_A_CALL = 2  # prepared together: of one shape, so that scenes share compiled programs, and with few fillers
+# Calls of one shape, so that scenes share compiled programs, and small, so that few fillers are worked on.
+OBJECTS_A_CALL = 2  # prepared together
 PAIRS_A_CALL = 8  # searched together: what fits a small CPU's caches
 # Every start is aligned for a third of the steps, and the best third of them go on: as right as all of them
 # (docs/relocalization.md) for two thirds of the work.
@@ -96,7 +97,10 @@ def search_poses(
 def _search_poses(
     pairs: tuple[AlignableObject, AlignableObject, jaxlie.SE3], search: SurfaceSearch, motion: MotionModel
 ) -> FoundPoses:
-    return jax.vmap(lambda pair: search_pair(*pair, search, motion))(pairs)
+    def one(pair: tuple[AlignableObject, AlignableObject, jaxlie.SE3]) -> FoundPoses:
+        return search_pair(*pair, search, motion)
+
+    return jax.lax.map(one, pairs, batch_size=PAIRS_A_CALL)
 
 
 def search_pair(
@@ -125,7 +129,9 @@ def search_pair(
 
 
 def in_rounds(
-    starts: jaxlie.SE3, aligned: Callable[[jaxlie.SE3, Float[Array, " steps"]], FoundPoses], search: SurfaceSearch
+    starts: jaxlie.SE3,
+    aligned: Callable[[jaxlie.SE3, Float[Array, " steps"]], FoundPoses],
+    search: SurfaceSearch,
 ) -> FoundPoses:
     """The best third of the starts, aligned by all steps: which those are is told after a third of the steps.
 

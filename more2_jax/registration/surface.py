@@ -42,7 +42,7 @@ from more2_jax.registration.search import (
 )
 from more2_jax.types import Registration
 
-PAIRS_A_CALL = 4  # refined together: a scene's pairs are few, and filling costs as much as pairs do
+PAIRS_A_CALL = 2  # refined in a call: a scene's pairs are few, and filling costs as much as pairs do
 STILL = 1e-2  # a last step below this (radians, and shares of the radius) has settled
 # How much worse "it did not move" may fit and still be chosen; so much worse, another pose still competes.
 STAYED_RATIO, STAYED_OFFSET = 1.1, 0.01
@@ -88,7 +88,7 @@ def _refine_poses(
     ) -> Registration:
         return refine_pair(prior, source, target, candidates, stayed, settings, motion)
 
-    if jax.default_backend() == "cpu":  # one after the other, so that what is not asked of the prior costs nothing
+    if jax.default_backend() == "cpu":  # one by one: what the prior is not asked about then costs nothing
         return jax.lax.map(lambda pair: one(*pair), pairs)
     return jax.vmap(one)(*pairs)
 
