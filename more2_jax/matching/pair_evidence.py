@@ -57,7 +57,10 @@ def asks_prior(search: SurfaceSearch, motion: MotionModel) -> bool:
 def off_completed_surfaces(
     prior: Prior, source: AlignableObject, target: AlignableObject, found: FoundPoses, search: SurfaceSearch
 ) -> tuple[FoundPoses, Float[np.ndarray, "p k 2"]]:
-    """The poses of every pair in the order that the prior's surfaces give them, and `off_fields` of each."""
+    """The poses of every pair in the order that the prior's surfaces give them, and `off_fields` of each.
+
+    By a few points of each cloud; of the first `LEADING` by all, which order these.
+    """
     one_call = partial(_off_completed_surfaces, prior, search=search)
     return chunked(one_call, PAIRS_A_CALL, (source, target, found))
 

@@ -9,6 +9,7 @@ fit about as well are told apart by that.
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from functools import partial
 
 import jax
@@ -171,27 +172,34 @@ def prior_cost(
     objects: tuple[AlignableObject, AlignableObject],
     settings: SurfaceRegistration,
 ) -> Float[Array, " k"]:
-    """What the prior adds to the costs of poses; nothing where it is not asked.
-
-    It is asked in the order of the costs, and not about a pose that fits so much worse than one asked before that it
-    could neither win nor compete if it lay on the completed surfaces exactly; nor if there is no other to choose.
-    """
+    """What the prior adds to the costs of poses; nothing where it is not asked."""
     weight = settings.search.field_weight
     if not weight:
         return jnp.zeros_like(costs)
     clouds = tuple(thinned(o.whole, settings.field_points).sampled for o in objects)
-    codes, near = (objects[0].code, objects[1].code), about_as_good(costs)
+    codes = objects[0].code, objects[1].code
+
+    def off_of(k: Array) -> Float[Array, ""]:
+        one = jax.tree.map(lambda x: x[k][None], poses)
+        return off_fields(prior, one, clouds, codes).mean()  # type: ignore[arg-type]
+
+    return asked_in_order(off_of, costs, weight)
+
+
+def asked_in_order(
+    off_of: Callable[[Array], Float[Array, ""]], costs: Float[Array, " k"], weight: float
+) -> Float[Array, " k"]:
+    """`field_cost` by `off_of` of every pose that it can decide about, 0 for the others that fit about as well.
+
+    Asked in the order of the costs. Not asked about is a pose that fits so much worse than one asked before that it
+    would neither win nor compete if it lay on the completed surfaces exactly; none is if there is no other to choose.
+    """
+    near = about_as_good(costs)
 
     def ask(least: Array, k: Array) -> tuple[Array, Array]:
-        T = jax.tree.map(lambda x: x[k][None], poses)
         # Twice, as "it did not move" may be chosen by the first, and others compete with it by the second.
         asked = near[k] & (near.sum() > 1) & (costs[k] <= as_good_as(as_good_as(least)))
-        off = jax.lax.cond(
-            asked,
-            lambda T: off_fields(prior, T, clouds, codes).mean(),  # type: ignore[arg-type]
-            lambda T: jnp.zeros(()),
-            T,
-        )
+        off = jax.lax.cond(asked, off_of, lambda k: jnp.zeros((), costs.dtype), k)
         return jnp.where(asked, jnp.minimum(least, costs[k] + weight * off), least), off
 
     order = jnp.argsort(costs)
