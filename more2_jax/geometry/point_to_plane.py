@@ -91,11 +91,13 @@ def normal_estimator(
     def normals(points: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
         # All moments about the cloud's own zero, by one matrix product; the cloud is centered, so none cancels badly.
         squared = sum((points[:, None, i] - cloud[None, :, i]) ** 2 for i in range(3))
-        weight = jnp.where(mask, jnp.exp(-0.5 * squared / width**2), 0.0)
-        weight = weight / jnp.maximum(weight.sum(axis=1, keepdims=True), 1e-30)
-        mean = jnp.matmul(weight, cloud, precision="highest")
         products = (cloud[:, :, None] * cloud[:, None, :]).reshape(-1, 9)
-        second = jnp.matmul(weight, products, precision="highest").reshape(-1, 3, 3)
+        columns = jnp.concatenate([jnp.ones_like(cloud[:, :1]), cloud, products], axis=1)
+        sums = jnp.matmul(
+            jnp.exp(-0.5 * squared / width**2), jnp.where(mask[:, None], columns, 0.0), precision="highest"
+        )
+        sums = sums / jnp.maximum(sums[:, :1], 1e-30)
+        mean, second = sums[:, 1:4], sums[:, 4:].reshape(-1, 3, 3)
         return least_axis(second - mean[:, :, None] * mean[:, None, :])
 
     return normals
@@ -328,9 +330,15 @@ def align(
     motion: MotionModel,
 ) -> jaxlie.SE3:
     """`steps` of `align_step`, the reach falling geometrically from the first to the second value."""
-    widths = jnp.geomspace(reach[0], reach[1], steps)
+    return align_by(T, source, target, jnp.geomspace(reach[0], reach[1], steps), motion)
 
-    def body(T: jaxlie.SE3, width: Array) -> tuple[jaxlie.SE3, None]:
-        return align_step(T, source, target, width, motion), None
 
-    return jax.lax.scan(body, T, widths)[0]
+def align_by(
+    T: jaxlie.SE3, source: Surface, target: Surface, reaches: Float[Array, " steps"], motion: MotionModel
+) -> jaxlie.SE3:
+    """A step of `align_step` with every reach in turn."""
+
+    def body(T: jaxlie.SE3, reach: Array) -> tuple[jaxlie.SE3, None]:
+        return align_step(T, source, target, reach, motion), None
+
+    return jax.lax.scan(body, T, reaches)[0]

@@ -82,7 +82,8 @@ def align_candidates(
     among = proposed(proposal_of(known, matcher), matcher.candidates)
     rows = np.argwhere(among)[:, ::-1]
     sides = local_batch(new), local_batch(old)
-    ready = [alignable(side, matcher.search) for side in sides]
+    real = [side.take(np.arange(n)) for side, n in zip(sides, (len(new), len(old)), strict=True)]
+    ready = [alignable(side, matcher.search) for side in real]
     pairs = paired_rows(*sides, rows, np.eye(4) if T_scene_scan is None else T_scene_scan)
     instances, objects = (
         jax.tree.map(lambda x, at=at: x[at], s) for s, at in zip(ready, rows.T, strict=True)

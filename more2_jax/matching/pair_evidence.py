@@ -7,6 +7,7 @@ the other to.
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from functools import partial
 
@@ -22,9 +23,12 @@ from more2_jax.network.prior import Prior
 from more2_jax.network.row_map import chunked
 from more2_jax.registration.pose_costs import field_cost, off_field, off_fields
 from more2_jax.registration.search import AlignableObject, FoundPoses, scaled_pose
+from more2_jax.types import Sampled
 
-OBJECTS_A_CALL = 8
-PAIRS_A_CALL = 16
+OBJECTS_A_CALL = 2
+PAIRS_A_CALL = 4
+FEW = 4  # of a cloud's points every fourth says which poses lie best on the completed surfaces,
+LEADING = 2  # and all of them, of so many poses, which of these
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,7 +61,10 @@ def asks_prior(search: SurfaceSearch, motion: MotionModel) -> bool:
 def off_completed_surfaces(
     prior: Prior, source: AlignableObject, target: AlignableObject, found: FoundPoses, search: SurfaceSearch
 ) -> tuple[FoundPoses, Float[np.ndarray, "p k 2"]]:
-    """The poses of every pair in the order that the prior's surfaces give them, and `off_fields` of each."""
+    """The poses of every pair in the order that the prior's surfaces give them, and `off_fields` of each.
+
+    By a few points of each cloud; of the first `LEADING` by all, which order these.
+    """
     one_call = partial(_off_completed_surfaces, prior, search=search)
     return chunked(one_call, PAIRS_A_CALL, (source, target, found))
 
@@ -72,11 +79,23 @@ def _off_completed_surfaces(
         source, target, found = pair
         s, t = (rescale(x, 1 / target.radius) for x in (source, target))
         clouds, poses = (s.coarse.sampled, t.coarse.sampled), scaled_pose(found.poses, 1 / target.radius)
-        off = off_fields(prior, poses, clouds, (s.code, t.code))
-        order = jnp.argsort(found.cost + field_cost(found.cost, off.mean(axis=1), search.field_weight))
+        few = tuple(every_nth(c, FEW) for c in clouds)
+        off = off_fields(prior, poses, few, (s.code, t.code))  # type: ignore[arg-type]
+        cost = found.cost + field_cost(found.cost, off.mean(axis=1), search.field_weight)
+        order = jnp.argsort(cost)
+        lead = order[:LEADING]
+        exact = off_fields(prior, jax.tree.map(lambda x: x[lead], poses), clouds, (s.code, t.code))
+        off = off.at[lead].set(exact)
+        exact_cost = found.cost + field_cost(found.cost, off.mean(axis=1), search.field_weight)
+        order = order.at[:LEADING].set(lead[jnp.argsort(exact_cost[lead])])
         return jax.tree.map(lambda x: x[order], (found, off))
 
-    return jax.lax.map(one, pairs, batch_size=8)
+    return jax.lax.map(one, pairs, batch_size=None if jax.default_backend() == "cpu" else 8)
+
+
+def every_nth(cloud: Sampled, n: int) -> Sampled:
+    """A sample thinned once more."""
+    return dataclasses.replace(cloud, points=cloud.points[::n], mask=cloud.mask[::n])
 
 
 def off_own_surface(prior: Prior, objects: AlignableObject) -> Float[np.ndarray, " b"]:

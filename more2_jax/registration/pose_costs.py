@@ -99,9 +99,14 @@ def free_space_cost(
     return cost
 
 
+def about_as_good(costs: Float[Array, " k"]) -> Bool[Array, " k"]:
+    """Which poses fit so well, by their costs, that the prior may tell them apart."""
+    return costs <= costs.min() + ABOUT_AS_WELL
+
+
 def field_cost(costs: Float[Array, " k"], off: Float[Array, " k"], weight: float) -> Float[Array, " k"]:
     """What the prior adds to the costs of poses: it tells those apart that fit about as well, and has no say beyond."""
-    return weight * jnp.where(costs <= costs.min() + ABOUT_AS_WELL, off, 1.0)
+    return weight * jnp.where(about_as_good(costs), off, 1.0)
 
 
 def off_fields(
@@ -125,8 +130,10 @@ def off_field(prior: Prior, T: jaxlie.SE3, cloud: Sampled, code: Embedding) -> F
     return jnp.where(jnp.isfinite(mean), mean, 1.0)
 
 
-def lowest_apart(cost: Float[Array, " n"], rotation: jaxlie.SO3, count: int) -> Int[Array, " count"]:
-    """Indices of the `count` lowest costs whose rotations are at least `APART_DEG` from one another.
+def lowest_apart(
+    cost: Float[Array, " n"], rotation: jaxlie.SO3, count: int, apart_deg: float = APART_DEG
+) -> Int[Array, " count"]:
+    """Indices of the `count` lowest costs whose rotations are at least `apart_deg` from one another.
 
     Many starts end in the same place; without this the few kept would be copies of one pose.
     """
@@ -135,7 +142,7 @@ def lowest_apart(cost: Float[Array, " n"], rotation: jaxlie.SO3, count: int) -> 
         best = jnp.argmin(cost)
         # ⟨q, q'⟩ = cos of half the angle between two rotations, either sign.
         half = jnp.abs(rotation.wxyz @ rotation.wxyz[best])
-        return jnp.where(half > jnp.cos(jnp.deg2rad(APART_DEG) / 2), jnp.inf, cost), best
+        return jnp.where(half > jnp.cos(jnp.deg2rad(apart_deg) / 2), jnp.inf, cost), best
 
     return jax.lax.scan(body, cost, length=count)[1]
 

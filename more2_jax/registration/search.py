@@ -6,15 +6,16 @@ is prepared once, whatever number of pairs it is part of.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 
 import jax
 import jax.numpy as jnp
 import jaxlie
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from more2_jax.config import MotionModel, SurfaceSearch
-from more2_jax.geometry.point_to_plane import Surface, align, coarsened, whole_surface
+from more2_jax.geometry.point_to_plane import Surface, align_by, coarsened, whole_surface
 from more2_jax.geometry.points import cloud_radius
 from more2_jax.geometry.transform import rescale
 from more2_jax.network.row_map import chunked
@@ -27,8 +28,13 @@ from more2_jax.registration.pose_costs import (
 from more2_jax.registration.starting_poses import candidate_poses, masked_mean
 from more2_jax.types import AnyArray, Embedding, LocalBatch, Sight, pytree, quantity
 
-OBJECTS_A_CALL = 8  # prepared together: of few shapes, so that scenes share compiled programs
-PAIRS_A_CALL = 16  # searched together
+# Calls of one shape, so that scenes share compiled programs, and small, so that few fillers are worked on.
+OBJECTS_A_CALL = 2  # prepared together
+PAIRS_A_CALL = 8  # searched together: what fits a small CPU's caches
+# Every start is aligned for a third of the steps, and the best third of them go on: as right as all of them
+# (docs/relocalization.md) for two thirds of the work.
+ROUNDS = 3
+SAME_DEG = 10.0  # of starts that have come this near to one another's rotation the best alone goes on
 
 
 @pytree
@@ -91,13 +97,10 @@ def search_poses(
 def _search_poses(
     pairs: tuple[AlignableObject, AlignableObject, jaxlie.SE3], search: SurfaceSearch, motion: MotionModel
 ) -> FoundPoses:
-    at_once = 8 if jax.default_backend() == "cpu" else PAIRS_A_CALL  # what fits a small CPU's caches
-
     def one(pair: tuple[AlignableObject, AlignableObject, jaxlie.SE3]) -> FoundPoses:
-        source, target, stayed = pair
-        return search_pair(source, target, stayed, search, motion)
+        return search_pair(*pair, search, motion)
 
-    return jax.lax.map(one, pairs, batch_size=at_once)
+    return jax.lax.map(one, pairs, batch_size=PAIRS_A_CALL)
 
 
 def search_pair(
@@ -112,14 +115,52 @@ def search_pair(
     s, t, stayed = rescale(source, 1 / radius), rescale(target, 1 / radius), scaled_pose(stayed, 1 / radius)
     means = tuple(masked_mean(x.coarse.sampled.points, x.coarse.sampled.mask) for x in (s, t))
     starts = candidate_poses((s.code, t.code), means, stayed, search.turns, motion)  # type: ignore[arg-type]
-    reach = (search.first_reach, search.last_reach)
-    poses = jax.vmap(lambda T: align(T, s.coarse, t.coarse, reach, search.steps, motion))(starts)
-    there, back = jax.vmap(lambda T: misfits_both_ways(T, s.coarse, t.coarse, (search.truncation,)))(poses)
-    cost = (there + back) / 2 + height_cost(poses, stayed, search, motion)
-    cost += free_space_cost(poses, (s.coarse, t.coarse), (s.sight, t.sight), search, motion)
-    best = lowest_apart(cost, poses.rotation(), min(search.keep, len(cost)))
-    found = FoundPoses(poses=poses, cost=cost, of_source=there, of_target=back)
+
+    def aligned(poses: jaxlie.SE3, reaches: Float[Array, " steps"]) -> FoundPoses:
+        poses = jax.vmap(lambda T: align_by(T, s.coarse, t.coarse, reaches, motion))(poses)
+        misfits = jax.vmap(lambda T: misfits_both_ways(T, s.coarse, t.coarse, (search.truncation,)))(poses)
+        cost = sum(misfits) / 2 + height_cost(poses, stayed, search, motion)
+        cost += free_space_cost(poses, (s.coarse, t.coarse), (s.sight, t.sight), search, motion)
+        return FoundPoses(poses=poses, cost=cost, of_source=misfits[0], of_target=misfits[1])
+
+    found = in_rounds(starts, aligned, search)
+    best = lowest_apart(found.cost, found.poses.rotation(), min(search.keep, len(found.cost)))
     return rescale(jax.tree.map(lambda x: x[best], found), radius)
+
+
+def in_rounds(
+    starts: jaxlie.SE3,
+    aligned: Callable[[jaxlie.SE3, Float[Array, " steps"]], FoundPoses],
+    search: SurfaceSearch,
+) -> FoundPoses:
+    """The best third of the starts, aligned by all steps: which those are is told after a third of the steps.
+
+    `aligned` takes poses and the reaches of some steps. As many poses have their turn each time, so that it is
+    compiled once: a third of the starts after the other, then the best third, round by round.
+    """
+    count, steps = -(-len(starts.wxyz_xyz) // ROUNDS), -(-search.steps // ROUNDS)
+    reaches = jnp.geomspace(search.first_reach, search.last_reach, ROUNDS * steps).reshape(ROUNDS, steps)
+    fillers = ROUNDS * count - len(starts.wxyz_xyz)
+    every = jax.tree.map(lambda x: jnp.concatenate([x, x[:fillers]]), starts)
+    unknown = jnp.ones(ROUNDS * count)
+    found = FoundPoses(poses=every, cost=unknown, of_source=unknown, of_target=unknown)
+
+    def turn(
+        carry: tuple[FoundPoses, Int[Array, " c"]], step: tuple[Array, Array]
+    ) -> tuple[tuple[FoundPoses, Int[Array, " c"]], None]:
+        (found, rows), (number, reach) = carry, step
+        best = partial(lowest_apart, found.cost, found.poses.rotation(), count, SAME_DEG)
+        rows = jax.lax.switch(
+            jnp.clip(number - ROUNDS + 1, 0, 2),
+            (lambda: number * count + jnp.arange(count), lambda: best().astype(rows.dtype), lambda: rows),
+        )
+        some = aligned(jax.tree.map(lambda x: x[rows], found.poses), reach)
+        return (jax.tree.map(lambda x, y: x.at[rows].set(y), found, some), rows), None
+
+    turns = jnp.arange(2 * ROUNDS - 1)
+    steps_of = turns, reaches[jnp.maximum(turns - ROUNDS + 1, 0)]
+    (found, rows), _ = jax.lax.scan(turn, (found, jnp.arange(count)), steps_of)
+    return jax.tree.map(lambda x: x[rows], found)
 
 
 def scaled_pose(T: jaxlie.SE3, factor: Float[Array, ""]) -> jaxlie.SE3:

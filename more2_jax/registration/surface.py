@@ -9,6 +9,7 @@ fit about as well are told apart by that.
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from functools import partial
 
 import jax
@@ -24,6 +25,7 @@ from more2_jax.network.prior import Prior
 from more2_jax.network.row_map import chunked
 from more2_jax.registration.pair_batch import PairBatch
 from more2_jax.registration.pose_costs import (
+    about_as_good,
     field_cost,
     free_space_cost,
     height_cost,
@@ -41,7 +43,7 @@ from more2_jax.registration.search import (
 )
 from more2_jax.types import Registration
 
-PAIRS_A_CALL = 4  # refined together: a scene's pairs are few, and filling costs as much as pairs do
+PAIRS_A_CALL = 2  # refined in a call: a scene's pairs are few, and filling costs as much as pairs do
 STILL = 1e-2  # a last step below this (radians, and shares of the radius) has settled
 # How much worse "it did not move" may fit and still be chosen; so much worse, another pose still competes.
 STAYED_RATIO, STAYED_OFFSET = 1.1, 0.01
@@ -87,6 +89,8 @@ def _refine_poses(
     ) -> Registration:
         return refine_pair(prior, source, target, candidates, stayed, settings, motion)
 
+    if jax.default_backend() == "cpu":  # one by one: what the prior is not asked about then costs nothing
+        return jax.lax.map(lambda pair: one(*pair), pairs)
     return jax.vmap(one)(*pairs)
 
 
@@ -172,9 +176,35 @@ def prior_cost(
     weight = settings.search.field_weight
     if not weight:
         return jnp.zeros_like(costs)
-    source, target = (thinned(o.whole, settings.field_points).sampled for o in objects)
-    off = off_fields(prior, poses, (source, target), (objects[0].code, objects[1].code))
-    return field_cost(costs, off.mean(axis=1), weight)
+    clouds = tuple(thinned(o.whole, settings.field_points).sampled for o in objects)
+    codes = objects[0].code, objects[1].code
+
+    def off_of(k: Array) -> Float[Array, ""]:
+        one = jax.tree.map(lambda x: x[k][None], poses)
+        return off_fields(prior, one, clouds, codes).mean()  # type: ignore[arg-type]
+
+    return asked_in_order(off_of, costs, weight)
+
+
+def asked_in_order(
+    off_of: Callable[[Array], Float[Array, ""]], costs: Float[Array, " k"], weight: float
+) -> Float[Array, " k"]:
+    """`field_cost` by `off_of` of every pose that it can decide about, 0 for the others that fit about as well.
+
+    Asked in the order of the costs. Not asked about is a pose that fits so much worse than one asked before that it
+    would neither win nor compete if it lay on the completed surfaces exactly; none is if there is no other to choose.
+    """
+    near = about_as_good(costs)
+
+    def ask(least: Array, k: Array) -> tuple[Array, Array]:
+        # Twice, as "it did not move" may be chosen by the first, and others compete with it by the second.
+        asked = near[k] & (near.sum() > 1) & (costs[k] <= as_good_as(as_good_as(least)))
+        off = jax.lax.cond(asked, off_of, lambda k: jnp.zeros((), costs.dtype), k)
+        return jnp.where(asked, jnp.minimum(least, costs[k] + weight * off), least), off
+
+    order = jnp.argsort(costs)
+    _, off = jax.lax.scan(ask, jnp.asarray(jnp.inf, costs.dtype), order)
+    return field_cost(costs, jnp.zeros_like(costs).at[order].set(off), weight)
 
 
 def choose(costs: Float[Array, " k"], stayed_is_last: bool, doubt: Float[Array, " k"] | float = 0.0) -> Array:
@@ -186,7 +216,12 @@ def choose(costs: Float[Array, " k"], stayed_is_last: bool, doubt: Float[Array, 
 
 def nearly_as_good(costs: Float[Array, " k"], best: Array) -> Bool[Array, " k"]:
     """Which poses explain the clouds about as well as the best."""
-    return costs <= costs[best] * STAYED_RATIO + STAYED_OFFSET
+    return costs <= as_good_as(costs[best])
+
+
+def as_good_as(cost: Float[Array, ""]) -> Float[Array, ""]:
+    """The highest cost that counts as nearly as good."""
+    return cost * STAYED_RATIO + STAYED_OFFSET
 
 
 def polished(
@@ -201,7 +236,7 @@ def polished(
     reach = (settings.last_reach, settings.polish_reach)
     finer = align(T, source, target, reach, settings.polish_steps, motion)
     fit = misfit(finer, source, target, truncations(settings))
-    return jax.tree.map(lambda x, y: jnp.where(fit <= before * STAYED_RATIO + STAYED_OFFSET, x, y), finer, T)
+    return jax.tree.map(lambda x, y: jnp.where(fit <= as_good_as(before), x, y), finer, T)
 
 
 def scored(

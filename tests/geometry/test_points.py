@@ -19,6 +19,7 @@ from more2_jax.geometry.points import (
     kabsch,
     kabsch_rotation,
     nearest,
+    nearest_index,
     sample,
     thin,
     trimmed,
@@ -95,7 +96,7 @@ def test_no_points_at_all():
 # --- nearest ----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("n", "m"), [(50, 33), (7, 1), (1, 64), (40, 2048)])
+@pytest.mark.parametrize(("n", "m"), [(50, 33), (7, 1), (1, 64), (30, 65), (30, 200), (40, 2048)])
 def test_nearest_is_scipys_up_to_its_ties(n, m):
     a, b = RNG.normal(size=(n, 3)), RNG.normal(size=(m, 3))
     _, squared = nearest(f32(a), every(n), f32(b), every(m))
@@ -109,6 +110,13 @@ def test_nearest_never_chooses_a_masked_row():
     b = f32([[5, 0, 0], [0, 0, 0], [-4, 0, 0]])
     index, squared = nearest(f32([[0, 0, 0]]), every(1), b, mask)
     assert (int(index[0]), float(squared[0])) == (2, 16)
+
+
+def test_of_rows_as_near_the_first_that_is_real_is_nearest():
+    b, mask = np.full((200, 3), 9.0), np.ones(200, bool)
+    b[[3, 70, 130, 199]], mask[3] = 1.0, False
+    index = nearest_index(f32([[1, 1, 1], [2, 1, 1], [9, 9, 9]]), f32(b), jnp.asarray(mask))
+    assert index.tolist() == [70, 70, 0]
 
 
 def test_nearest_of_what_is_not_there_is_far():
