@@ -180,7 +180,7 @@ def fitted(pairs: Sequence[ScanPair], like: Calibration) -> Calibration:
     signs = [SIGN.get(k, -1.0) for k in names]
     bounds = [(None, None), *((0.0, None) if s > 0 else (None, 0.0) for s in signs)]
     w = minimize(loss, np.zeros(x.shape[1]), jac=True, bounds=bounds, method="L-BFGS-B").x
-    return Calibration(**{"likeness": 0.0} | dict(zip(["intercept", *names], w.tolist(), strict=True)))
+    return replace(like, raised=0.0, **dict(zip(["intercept", *names], w.tolist(), strict=True)))
 
 
 def left_out(pairs: Sequence[ScanPair], like: Calibration) -> dict[str, Calibration]:

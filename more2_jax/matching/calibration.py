@@ -35,11 +35,8 @@ class Calibration:
 
     intercept: float
     likeness: float
-    size: float = 0.0
-    nearer: float = 0.0  # of the smaller mean distance of the two ways, truncated at a share of the radius,
-    farther: float = 0.0  # and of the larger
-    apart_less: float = 0.0  # of the smaller mean distance of the two ways, truncated at `APART_M`,
-    apart_more: float = 0.0  # and of the larger
+    apart_less: float  # of the smaller mean distance of the two ways, truncated at `APART_M`,
+    apart_more: float  # and of the larger
     contradicted: float = 0.0  # of the share of either cloud where the other scan shows empty space
     lift: float = 0.0  # of a change of height, in shares of `MOST_LIFT_M`, at most 1
     top: float = 0.0  # of `top_m`, in shares of `HIGHEST_M`, at most 1
@@ -67,17 +64,18 @@ UPRIGHT = Calibration(
     raised=2.0,
 )
 FREE = Calibration(
-    intercept=4.5,
-    nearer=-9.4,
-    likeness=4.3,
-    off_less=-4.5,
-    off_more=-10.8,
-    raised=3.0,
+    intercept=6.9,
+    likeness=3.0,
+    apart_less=-9.2,
+    apart_more=-1.1,
+    off_less=-7.2,
+    off_more=-8.3,
+    raised=2.0,
 )
 
 
 # Without the prior's say.
-UNASKED = Calibration(intercept=3.7, nearer=-10.7, farther=-7.6, size=-0.5, likeness=5.0, raised=3.0)
+UNASKED = Calibration(intercept=6.4, likeness=3.0, apart_less=-9.2, apart_more=-6.0, raised=2.0)
 
 
 def calibrated(
@@ -117,13 +115,9 @@ def weighed(known: dict[str, Float[np.ndarray, "*pairs"]], c: Calibration) -> Fl
 
 def features(evidence: PairEvidence, compared: Compared) -> dict[str, Float[np.ndarray, "*pairs"]]:
     """What each weight of a `Calibration` is multiplied with, by its name."""
-    ways = np.stack([evidence.of_source, evidence.of_target])
     apart = np.stack([evidence.apart_source, evidence.apart_target])
     off = np.stack([evidence.off_source, evidence.off_target])
     return {
-        "nearer": ways.min(axis=0),
-        "farther": ways.max(axis=0),
-        "size": compared.size,
         "likeness": compared.likeness,
         "apart_less": apart.min(axis=0),
         "apart_more": apart.max(axis=0),

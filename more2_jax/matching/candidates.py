@@ -48,8 +48,8 @@ class AlignedPairs:
     top_gap_m: Float[np.ndarray, " p"]  # by how much the object's top is higher than the instance's
     off: Float[np.ndarray, "p k 2"]  # off the completed surfaces; 0 where that is not asked
     off_own: Float[np.ndarray, " p"]
+    metric: MetricEvidence
     seen: Seen | None = None  # what both scans saw; None where that is no evidence (any orientation)
-    metric: MetricEvidence | None = None
     height_m: float = 0.0  # upright: that the scan was taken to lie at
 
     def take(self, chosen: Sequence[tuple[int, int]]) -> PairBatch:
@@ -93,10 +93,9 @@ def align_candidates(
     if asks_prior(matcher.search, motion):
         found, off = off_completed_surfaces(prior, instances, objects, found, matcher.search)
         own = np.max([off_own_surface(prior, x)[at] for x, at in zip(ready, rows.T, strict=True)], axis=0)
-    T_old_new, metric = pairs.to_world(found.poses), None
-    if motion == "upright":
-        seen = seen or seen_in(old, new)
-        metric = metric_evidence((new, old), sides, tuple(ready), rows, T_old_new, seen)  # type: ignore[arg-type]
+    T_old_new = pairs.to_world(found.poses)
+    seen = (seen or seen_in(old, new)) if motion == "upright" else None
+    metric = metric_evidence((new, old), sides, tuple(ready), rows, T_old_new, seen)  # type: ignore[arg-type]
     return AlignedPairs(
         among=among,
         pairs=pairs,
@@ -153,21 +152,16 @@ def evidence_at(
         cost = np.asarray(found.cost) - height_penalty(np.abs(z - stayed), radius, search)
         best = np.argmin(cost + height_penalty(lift, radius, search), axis=1)
     at = np.arange(len(best)), best
-    apart, contradicted = np.zeros((len(best), 2)), np.zeros(len(best))
-    if aligned.metric is not None:
-        apart, contradicted = aligned.metric.apart[at], aligned.metric.contradicted[at]
     return PairEvidence(
         pose=best,
-        of_source=np.asarray(found.of_source)[at],
-        of_target=np.asarray(found.of_target)[at],
+        apart_source=aligned.metric.apart[at][:, 0],
+        apart_target=aligned.metric.apart[at][:, 1],
+        contradicted=aligned.metric.contradicted[at],
         lift_m=lift[at],
         radius_m=radius,
         off_source=aligned.off[at][:, 0],
         off_target=aligned.off[at][:, 1],
         off_own=aligned.off_own,
-        apart_source=apart[:, 0],
-        apart_target=apart[:, 1],
-        contradicted=contradicted,
     )
 
 

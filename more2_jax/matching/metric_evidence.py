@@ -1,4 +1,4 @@
-"""How far pairs of clouds lie apart in meters, and what of them the other scan shows to be empty space (upright).
+"""How far pairs of clouds lie apart in meters, and (upright) what of them the other scan shows to be empty space.
 
 Beyond the paper (`EvidenceMatcher`). What keeps two scans of one object apart (a sensor's noise, drift, the voxels of
 fusion) is so many centimeters whatever the size of the object. And a mask that is cut or dirty changes what an object
@@ -60,17 +60,18 @@ def metric_evidence(
     ready: tuple[AlignableObject, AlignableObject],
     pairs: Int[np.ndarray, "p 2"],
     T_old_new: Float[np.ndarray, "p k 4 4"],
-    seen: Seen,
+    seen: Seen | None,
 ) -> MetricEvidence:
     """Compares samples of instances and objects with all of the other cloud, and of the other scan.
 
     `sides`, `batches`, `ready`: instances (new scan's frame), then objects (scene's frame). `pairs`: rows of both.
+    Without `seen` nothing is known to be empty.
     """
     trees = [[KDTree(o.points) for o in side] for side in sides]
     samples = [samples_of(x, b, len(side)) for x, b, side in zip(ready, batches, sides, strict=True)]
     apart = np.zeros((*T_old_new.shape[:2], 2))
     empty = np.zeros_like(apart)
-    for way, space in ((0, seen[0]), (1, seen[1])):
+    for way in (0, 1):
         poses = T_old_new if way == 0 else np.linalg.inv(T_old_new)
         moved = [
             apply_pose(T, samples[way][pair[way]])
@@ -81,9 +82,10 @@ def metric_evidence(
         apart[..., way] = np.reshape(
             [mean_apart(trees[1 - way][o], p) for o, p in zip(others, moved, strict=True)], apart.shape[:2]
         )
-        ends = np.cumsum([len(p) for p in moved])[:-1]
-        lies_empty = space.empty(np.concatenate(moved), APART_M)
-        empty[..., way] = np.reshape([e.mean() for e in np.split(lies_empty, ends)], apart.shape[:2])
+        if seen is not None:
+            ends = np.cumsum([len(p) for p in moved])[:-1]
+            lies_empty = np.split(seen[way].empty(np.concatenate(moved), APART_M), ends)
+            empty[..., way] = np.reshape([e.mean() for e in lies_empty], apart.shape[:2])
     return MetricEvidence(apart=apart, contradicted=empty.max(axis=-1))
 
 

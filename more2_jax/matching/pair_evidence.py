@@ -36,10 +36,10 @@ class PairEvidence:
     """What aligning p pairs says of each, at the pose that fits best; host arrays."""
 
     pose: Int[np.ndarray, " p"]  # which of the poses found that is
-    of_source: Float[
-        np.ndarray, " p"
-    ]  # mean truncated distance of the source's points, shares of the truncation,
-    of_target: Float[np.ndarray, " p"]  # and of the target's
+    # `MetricEvidence` at that pose: mean distances in shares of `APART_M`, and the share in empty space.
+    apart_source: Float[np.ndarray, " p"]
+    apart_target: Float[np.ndarray, " p"]
+    contradicted: Float[np.ndarray, " p"]
     lift_m: Float[np.ndarray, " p"]  # change of height
     radius_m: Float[np.ndarray, " p"]  # of the target
     # How far, 0 to 1, the source's points lie off the target's completed surface, the target's off the source's, and
@@ -47,10 +47,6 @@ class PairEvidence:
     off_source: Float[np.ndarray, " p"]
     off_target: Float[np.ndarray, " p"]
     off_own: Float[np.ndarray, " p"]
-    # Upright (`MetricEvidence`): mean distances in shares of `APART_M`, and the share in empty space. Else 0.
-    apart_source: Float[np.ndarray, " p"]
-    apart_target: Float[np.ndarray, " p"]
-    contradicted: Float[np.ndarray, " p"]
 
 
 def asks_prior(search: SurfaceSearch, motion: MotionModel) -> bool:

@@ -54,8 +54,6 @@ class FoundPoses:
 
     poses: jaxlie.SE3 = quantity("pose")  # (*b, k): source's local frame to target's
     cost: Float[AnyArray, "*b k"] = quantity("invariant")  # by which they are ordered
-    of_source: Float[AnyArray, "*b k"] = quantity("invariant")  # mean truncated distance of its points, and
-    of_target: Float[AnyArray, "*b k"] = quantity("invariant")  # of the target's: 0 none, 1 nothing agrees
 
 
 def alignable(batch: LocalBatch, search: SurfaceSearch) -> AlignableObject:
@@ -121,7 +119,7 @@ def search_pair(
         misfits = jax.vmap(lambda T: misfits_both_ways(T, s.coarse, t.coarse, (search.truncation,)))(poses)
         cost = sum(misfits) / 2 + height_cost(poses, stayed, search, motion)
         cost += free_space_cost(poses, (s.coarse, t.coarse), (s.sight, t.sight), search, motion)
-        return FoundPoses(poses=poses, cost=cost, of_source=misfits[0], of_target=misfits[1])
+        return FoundPoses(poses=poses, cost=cost)
 
     found = in_rounds(starts, aligned, search)
     best = lowest_apart(found.cost, found.poses.rotation(), min(search.keep, len(found.cost)))
@@ -142,8 +140,7 @@ def in_rounds(
     reaches = jnp.geomspace(search.first_reach, search.last_reach, ROUNDS * steps).reshape(ROUNDS, steps)
     fillers = ROUNDS * count - len(starts.wxyz_xyz)
     every = jax.tree.map(lambda x: jnp.concatenate([x, x[:fillers]]), starts)
-    unknown = jnp.ones(ROUNDS * count)
-    found = FoundPoses(poses=every, cost=unknown, of_source=unknown, of_target=unknown)
+    found = FoundPoses(poses=every, cost=jnp.ones(ROUNDS * count))
 
     def turn(
         carry: tuple[FoundPoses, Int[Array, " c"]], step: tuple[Array, Array]

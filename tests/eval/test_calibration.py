@@ -30,7 +30,9 @@ from more2_jax.matching.candidates import align_candidates, odds_of
 from more2_jax.network.embedding_batch import embed
 from more2_jax.types import ObservedObject
 
-PLANTED = Calibration(intercept=2.0, nearer=-6.0, farther=0.0, size=-3.0, likeness=4.0, off_less=-5.0)
+PLANTED = Calibration(
+    intercept=2.0, apart_less=-6.0, apart_more=0.0, contradicted=-3.0, likeness=4.0, off_less=-5.0
+)
 
 
 def drawn(room: str, count: int, seed: int, c: Calibration = PLANTED) -> ScanPair:
@@ -46,16 +48,18 @@ def drawn(room: str, count: int, seed: int, c: Calibration = PLANTED) -> ScanPai
 
 
 def test_weights_that_drew_the_truth_are_found_and_evidence_never_speaks_the_wrong_way():
-    found = fitted([drawn("a", 20_000, 0), drawn("b", 20_000, 1)], dataclasses.replace(PLANTED, farther=-1.0))
+    found = fitted(
+        [drawn("a", 20_000, 0), drawn("b", 20_000, 1)], dataclasses.replace(PLANTED, apart_more=-1.0)
+    )
     for name, value in dataclasses.asdict(PLANTED).items():
         assert getattr(found, name) == pytest.approx(value, abs=0.35), name
-    wrong = drawn("c", 20_000, 2, dataclasses.replace(PLANTED, nearer=6.0))
-    assert fitted([wrong], PLANTED).nearer == 0.0
+    wrong = drawn("c", 20_000, 2, dataclasses.replace(PLANTED, apart_less=6.0))
+    assert fitted([wrong], PLANTED).apart_less == 0.0
 
 
 def test_only_evidence_that_the_calibration_asks_is_fitted():
     assert fitted([drawn("a", 500, 0)], UNASKED).off_less == 0.0
-    assert fitted([drawn("a", 500, 0)], FREE).farther == 0.0
+    assert fitted([drawn("a", 500, 0)], FREE).contradicted == 0.0
 
 
 def test_a_pair_the_prior_knows_nothing_of_teaches_nothing_and_is_weighed_without_it():
@@ -79,7 +83,7 @@ def test_colors_are_evidence_with_a_weight_of_their_own():
     color = rng.choice([-3.0, 3.0], 40_000)
     one = rng.random(40_000) < expit(pair.odds(PLANTED)[0] + color)
     found = fitted([dataclasses.replace(pair, color=color, one=one[None])], PLANTED)
-    assert found.nearer == pytest.approx(PLANTED.nearer, abs=0.35)
+    assert found.apart_less == pytest.approx(PLANTED.apart_less, abs=0.35)
     assert found.intercept == pytest.approx(PLANTED.intercept, abs=0.35)
 
 

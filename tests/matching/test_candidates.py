@@ -36,7 +36,7 @@ from more2_jax.types import ObservedObject
 pytestmark = pytest.mark.quickly
 
 FIELDS = (
-    *("of_source", "of_target", "off_source", "off_target", "apart_source", "apart_target"),
+    *("off_source", "off_target", "apart_source", "apart_target"),
     *("contradicted", "lift_m"),
 )
 
@@ -79,9 +79,6 @@ def test_log_odds_are_linear_and_the_two_ways_have_no_order():
     known = Compared(**{k: rng.uniform(size=3) for k in ("size", "likeness", "top_m", "color")})
     c = Calibration(
         intercept=1.0,
-        nearer=2.0,
-        farther=3.0,
-        size=4.0,
         likeness=5.0,
         lift=6.0,
         top=7.0,
@@ -91,9 +88,9 @@ def test_log_odds_are_linear_and_the_two_ways_have_no_order():
         apart_more=11.0,
         contradicted=12.0,
     )
-    by_hand = 1 + 4 * known.size + 5 * known.likeness + known.color + 12 * values["contradicted"]
+    by_hand = 1 + 5 * known.likeness + known.color + 12 * values["contradicted"]
     by_hand += 6 * np.minimum(values["lift_m"] / MOST_LIFT_M, 1) + 7 * np.minimum(known.top_m / HIGHEST_M, 1)
-    for k, less, more in (("of", 2, 3), ("off", 8, 9), ("apart", 10, 11)):
+    for k, less, more in (("off", 8, 9), ("apart", 10, 11)):
         a, b = values[f"{k}_source"], values[f"{k}_target"]
         by_hand += less * np.minimum(a, b) + more * np.maximum(a, b)
     np.testing.assert_allclose(log_odds(evidence, known, c), by_hand)
@@ -116,9 +113,10 @@ def test_the_prior_is_asked_in_any_orientation_alone_and_only_where_it_knows_the
     without = dataclasses.replace(search, field_weight=0.0)
     np.testing.assert_array_equal(calibrated(evidence, known, without, "free"), by[UNASKED])
     assert not (UPRIGHT.off_less or UPRIGHT.off_more or UNASKED.off_less or UNASKED.off_more)
-    # Upright, distances are in meters and scans say what is empty; in any orientation neither is asked.
-    assert not (UPRIGHT.nearer or UPRIGHT.farther)
-    assert not any((c.apart_less, c.apart_more, c.contradicted) != (0, 0, 0) for c in (FREE, UNASKED))
+    # Which way is up, so what lies below, is known of upright things alone.
+    assert UPRIGHT.contradicted and not any(
+        (c.contradicted, c.lift, c.top) != (0, 0, 0) for c in (FREE, UNASKED)
+    )
 
 
 def observed(prior, clouds):

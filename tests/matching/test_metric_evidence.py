@@ -128,5 +128,5 @@ def test_empty_space_lowers_the_odds_and_is_asked_upright_alone(tiny_prior, scan
     free = align_candidates(
         tiny_prior, old, new, EvidenceMatcher(search=dataclasses.replace(SEARCH, field_weight=0.0)), "free"
     )
-    assert free.metric is None and free.seen is None
+    assert free.seen is None and not free.metric.contradicted.any() and free.metric.apart.any()
     assert jnp.isfinite(odds_of(free, SEARCH, "free")).all()

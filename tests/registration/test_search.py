@@ -24,12 +24,10 @@ def in_rounds_of(turns_deg, cost):
     def aligned(poses, reaches):
         row = poses.wxyz_xyz[:, 6].astype(int)
         moved = jaxlie.SE3(poses.wxyz_xyz.at[:, 4].add(reaches.sum()))
-        return FoundPoses(poses=moved, cost=jnp.asarray(cost)[row], of_source=1.0 * row, of_target=-1.0 * row)
+        return FoundPoses(poses=moved, cost=jnp.asarray(cost)[row])
 
     found = quick_jit(lambda s: in_rounds(jaxlie.SE3(s), aligned, SEARCH))(starts)
     rows = np.asarray(found.poses.wxyz_xyz[:, 6]).astype(int)
-    for values in (found.of_source, -found.of_target):
-        np.testing.assert_array_equal(values, rows)
     np.testing.assert_array_equal(found.cost, np.asarray(cost, np.float32)[rows])
     return rows.tolist(), np.asarray(found.poses.wxyz_xyz[:, 4])
 
