@@ -363,7 +363,12 @@ class Repair:
     instances: tuple[int, ...] = ()  # of the scan, that are parts of it, the one that was matched first
     absorbed: tuple[str, ...] = ()  # ids that parts of it had in the scene before
     divided: str | None = None  # id of the other object that one mask, `instances`, held
-    share: float = 1.0  # of the part, that lies on the whole
+    # Points of one mask (of an earlier scan, where there are no `instances`) that are something else: floor or wall,
+    dropped: int = 0
+    neighbor: str | None = None  # or of the object with this id.
+    regained: int = 0  # points beside a mask that are the object's
+    points: int = 0  # of the mask, before any were dropped or regained
+    share: float = 1.0  # of the part, that lies on the whole; of points dropped or regained, that surely are what is said
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -281,7 +281,7 @@ def _embeddings(path: Path) -> dict[str, Embedding]:
 
 def _repair(content: dict[str, Any]) -> Repair:
     lists = {k: tuple(content[k]) for k in ("instances", "absorbed")}
-    return Repair(object=content["object"], **lists, divided=content.get("divided"), share=content["share"])
+    return Repair(**content | lists)
 
 
 def _frame(content: dict[str, Any] | None) -> Frame:
