@@ -52,9 +52,7 @@ def room_planes(cloud: Points, background: Points, room: Points) -> list[RoomPla
     """The planes that bound the room around a cloud; `room` is all of the scan, `background` what is no object."""
     tree = KDTree(cloud)
     near, around = (within(tree, p, AROUND_M) for p in (background, room))
-    return [
-        p for p in planes_of(near) if is_wide(p.points) and behind(p, around) <= MOST_BEHIND
-    ]
+    return [p for p in planes_of(near) if is_wide(p.points) and behind(p, around) <= MOST_BEHIND]
 
 
 def planes_of(points: Points) -> Iterator[RoomPlane]:

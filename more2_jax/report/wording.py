@@ -103,7 +103,9 @@ def _border_text(r: Repair) -> str:
     """`40 of 900 points in the mask of object_002 (instance 3) are floor or wall, and left out`."""
     mask = f"instance {r.instances[0]}" if r.instances else "in an earlier scan"
     if r.regained:
-        return f"{r.regained} points beside the {r.points} of {r.object} ({mask}) are part of it, and taken in"
+        return (
+            f"{r.regained} points beside the {r.points} of {r.object} ({mask}) are part of it, and taken in"
+        )
     whose = f"{r.neighbor}'s" if r.neighbor else "floor or wall"
     return f"{r.dropped} of {r.points} points of {r.object} ({mask}) are {whose}, and left out"
 

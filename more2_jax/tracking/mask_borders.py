@@ -28,7 +28,9 @@ Distances = Float[np.ndarray, " n"]
 MOST_DROPPED = 0.35  # share of a mask that may be its neighbors': where more is, it is two objects in one
 LEAST_CHANGED = 0.02  # share of a mask, that is lost or comes back: fewer points are as likely wrong
 TOUCHING = 2.0  # times the spacing of its points: what lies so near a cloud goes on in it
-GOES_ON = 0.3  # as many points must touch the neighbor's own, as a share of those that touch the rest of the mask
+GOES_ON = (
+    0.3  # as many points must touch the neighbor's own, as a share of those that touch the rest of the mask
+)
 THINNED = 20_000  # points of a background, at even steps, that floor and walls are sought in
 BESIDE_M = 0.15  # of what may come back: points that tell how it faces
 
@@ -59,11 +61,15 @@ class Border:
 
     def repair(self, scan: int) -> Repair:
         """As scan `scan` led to it."""
-        v = self.view
-        told = {"dropped" if self.neighbor else "regained": len(self.points)}
-        ids = (v.instance,) if v.scan == scan else ()
+        v, count = self.view, len(self.points)
         return Repair(
-            object=v.id, instances=ids, neighbor=self.neighbor, points=len(v.own), share=self.sure, **told
+            object=v.id,
+            instances=(v.instance,) if v.scan == scan else (),
+            dropped=count if self.neighbor else 0,
+            neighbor=self.neighbor,
+            regained=0 if self.neighbor else count,
+            points=len(v.own),
+            share=self.sure,
         )
 
 
@@ -206,11 +212,15 @@ def with_borders(objects: Sequence[SceneObject], borders: Sequence[Border]) -> l
             kept[np.flatnonzero(o.point_scan == b.view.scan)[b.rows]] = False
         more = [b for b in own if b.neighbor is None]
         points = [apply_pose(b.view.T_ref_scan, b.points) for b in more]
-        normals = None if o.normals is None else np.concatenate([o.normals[kept], *map(np.zeros_like, points)])
+        normals = (
+            None if o.normals is None else np.concatenate([o.normals[kept], *map(np.zeros_like, points)])
+        )
         changed[k] = dataclasses.replace(
             o,
             points=np.concatenate([o.points[kept], *points]),
-            point_scan=np.concatenate([o.point_scan[kept], *(np.full(len(b.points), b.view.scan) for b in more)]),
+            point_scan=np.concatenate(
+                [o.point_scan[kept], *(np.full(len(b.points), b.view.scan) for b in more)]
+            ),
             normals=normals,
             mesh=None,
         )

@@ -65,9 +65,7 @@ def without_room(instances: Sequence[Instance], background: Points, fewest: int)
         among = np.concatenate([i.points, within(KDTree(i.points), background, BESIDE_M)])
         on, sure = on_planes(i.points, room_planes(i.points, background, room), among)
         if LEAST_DROPPED <= on.mean() <= MOST_DROPPED and (~on).sum() >= fewest:
-            dropped[i.id] = Dropped(
-                count=int(on.sum()), points=len(on), sure=float(sure.sum() / on.sum())
-            )
+            dropped[i.id] = Dropped(count=int(on.sum()), points=len(on), sure=float(sure.sum() / on.sum()))
             cleared.append(some_points(i, ~on))
         else:
             cleared.append(i)
