@@ -212,9 +212,8 @@ class SceneConfig:
     static_m: float = 0.05  # and moved by less, is static
     # Match and register against all seen so far, not the reference observation.
     accumulate_target: bool = False
-    repair_masks: bool = (
-        False  # join what masks split and divide what they merge, where another scan shows it
-    )
+    # Join what masks split, divide what they merge, leave out floor and neighbors, take in what they cut off.
+    repair_masks: bool = False
     accumulate_misfit: float = 1.0  # an observation whose registration fits worse is left out of the shape
     matching: Matcher = field(default_factory=CodeMatcher)
     registration: RegistrationMethod = field(default_factory=DescentRegistration)

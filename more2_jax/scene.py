@@ -22,9 +22,10 @@ from more2_jax.refinement.joint_of_objects import fit_objects
 from more2_jax.refinement.pose_graph_of_objects import refine_object_poses
 from more2_jax.tracking.accumulated import accumulated_objects, embed_accumulated, with_refined
 from more2_jax.tracking.changes import changes_between, forgotten, not_seen_in
-from more2_jax.tracking.identify import Identified, identify
+from more2_jax.tracking.identify import Found, Identified, identify
 from more2_jax.tracking.leveling import as_given, level_of, leveled
 from more2_jax.tracking.looked_at import not_looked_at
+from more2_jax.tracking.mask_borders import mend_borders
 from more2_jax.tracking.merged_masks import Divided, divide_merged
 from more2_jax.tracking.object_views import few_sensors, instance_sights, object_sights
 from more2_jax.tracking.objects import (
@@ -35,6 +36,7 @@ from more2_jax.tracking.objects import (
     seen_again,
 )
 from more2_jax.tracking.relocalize import known_object, relocalize
+from more2_jax.tracking.room_points import Cleared, without_room
 from more2_jax.tracking.scan_frame import Rooms
 from more2_jax.tracking.split_masks import mend_splits
 from more2_jax.types import (
@@ -61,8 +63,9 @@ def start_scene(
     `progress` is told of every stage, here and below.
     """
     level, T_level_scan = leveled_scan(scan, config)
-    instances, skipped = usable(level, config)
-    timing: dict[str, float] = {}
+    masks, skipped = usable(level, config)
+    cleared = without_floor_and_walls(masks, level, config)
+    instances, timing = cleared.instances, dict[str, float]()
     with staged(timing, progress, "encode", len(instances), scan=scan.name):
         embeddings = embed(prior, [i.points for i in instances], [i.normals for i in instances])
     objects = new_objects(0, 0, range(len(instances)), instances, embeddings)
@@ -71,7 +74,7 @@ def start_scene(
         preset=config.preset,
         prior=prior.name,
         upright=config.upright,
-        scans=(record(0, scan, instances, skipped, frame),),
+        scans=(record(0, scan, instances, skipped, frame, repairs=cleared.repairs(0, objects)),),
         objects=tuple(objects),
         changes=(),
         timing_s=timing,
@@ -114,10 +117,11 @@ def add_scan(
     makes them anew. Raises ValueError if the scan has no usable instance.
     """
     level, T_level_scan = leveled_scan(scan, config, scene.scans[0])
-    instances, skipped = usable(level, config)
+    masks, skipped = usable(level, config)
+    cleared = without_floor_and_walls(masks, level, config)
     index, timing = len(scene.scans), dict(scene.timing_s)
     stage = partial(staged, timing, progress, scan=scan.name)
-    whole, old, new, identified = who_is_who(prior, scene, instances, level, config, stage)
+    whole, old, new, identified = who_is_who(prior, scene, cleared.instances, level, config, stage)
     found = identified.found
     with stage("register", len(found)):
         seen, frame = relocalize(prior, whole.objects, old, whole.instances, new, identified, index, config)
@@ -126,6 +130,7 @@ def add_scan(
     objects = mended.objects
     for f, observation in zip(found, seen, strict=True):
         objects[f.object] = seen_again(objects[f.object], mended.instances[f.instance], observation)
+    objects, borders = with_borders_mended(objects, found, scene, level, config)
     if config.accumulate_target:
         with stage("encode", len(found)):
             changed = [f.object for f, s in zip(found, seen, strict=True) if s.accumulated]
@@ -138,7 +143,8 @@ def add_scan(
     objects, frame = as_given([*mended.whole(objects), *fresh.values()], index, frame, T_level_scan)
     scene = forgotten(scene, mended.absorbed)
     repairs = (*whole.repairs, *whole.masks(found, fresh), *mended.repairs)
-    scans = (*scene.scans, record(index, scan, instances, skipped, frame, unseen, repairs))
+    repairs = (*repairs, *cleared.repairs(index, objects, mended.repairs), *borders)
+    scans = (*scene.scans, record(index, scan, masks, skipped, frame, unseen, repairs))
     changes = changes_between(objects, index - 1, index, config, chance, not_seen_in(scans))
     changed = {"scans": scans, "objects": tuple(objects), "changes": (*scene.changes, changes)}
     return dataclasses.replace(scene, **changed, timing_s=timing)
@@ -221,6 +227,24 @@ def usable(scan: Scan, config: SceneConfig) -> tuple[list[Instance], tuple[Skipp
     if len(small) == len(scan.instances):
         raise ValueError(f"{scan.name}: {len(small)} instances, none with {need} points or more; needed one")
     return [i for i in scan.instances if len(i.points) >= need], (*scan.skipped, *skipped)
+
+
+def without_floor_and_walls(instances: list[Instance], scan: Scan, config: SceneConfig) -> Cleared:
+    """The instances without points that are floor or wall, where masks are mended."""
+    if not config.repair_masks:
+        return Cleared(instances=instances)
+    return without_room(instances, remembered(scan.background), config.min_points)
+
+
+def with_borders_mended(
+    objects: list[SceneObject], found: Sequence[Found], scene: LivingScene, scan: Scan, config: SceneConfig
+) -> tuple[list[SceneObject], tuple[Repair, ...]]:
+    """The objects with the borders of what the scans saw of them mended, where masks are. `scan`: new, leveled."""
+    if not config.repair_masks:
+        return objects, ()
+    index = len(scene.scans)
+    backgrounds = {s.index: s.background for s in scene.scans} | {index: scan.background}
+    return mend_borders(objects, [f.object for f in found], index, backgrounds)
 
 
 def leveled_scan(scan: Scan, config: SceneConfig, first: ScanRecord | None = None) -> tuple[Scan, Pose]:

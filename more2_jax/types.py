@@ -72,8 +72,7 @@ class PointCloud:
 
     points: Float[Array, "*batch n 3"] = quantity("position")  # meters, relative to `origin`
     mask: Bool[Array, "*batch n"] = quantity("invariant")  # True where the point is real
-    # In the scan's frame.
-    origin: Float[Array | np.ndarray, "*batch 3"] | None = quantity("origin", default=None)
+    origin: Float[Array | np.ndarray, "*batch 3"] | None = quantity("origin", default=None)  # scan's frame
     # Unit normals of the surface, outward; zeros where not known. None: nowhere.
     normals: Float[Array, "*batch n 3"] | None = quantity("direction", default=None)
 
@@ -106,18 +105,10 @@ class Sight:
     (`geometry.free_space`); in the object's frame, meters."""
 
     eye: Float[Array | np.ndarray, "*batch v 3"] = quantity("position")  # where each stood
-    turn: Float[Array | np.ndarray, "*batch v 3 3"] = quantity(
-        "direction"
-    )  # rows: across, down its image, forward
-    half: Float[Array | np.ndarray, "*batch v"] = quantity(
-        "invariant"
-    )  # tangent of half the angle of the image
-    side: Float[Array | np.ndarray, "*batch v"] = quantity(
-        "invariant"
-    )  # pixels of a row, the first of `clear`
-    clear: Float[Array | np.ndarray, "*batch v p p"] = quantity(
-        "length"
-    )  # free along a pixel's ray; 0: not known
+    turn: Float[Array | np.ndarray, "*batch v 3 3"] = quantity("direction")  # rows: across, down, forward
+    half: Float[Array | np.ndarray, "*batch v"] = quantity("invariant")  # tangent of half the image's angle
+    side: Float[Array | np.ndarray, "*batch v"] = quantity("invariant")  # pixels of a row, first of `clear`
+    clear: Float[Array | np.ndarray, "*batch v p p"] = quantity("length")  # free along a ray; 0: not known
 
 
 @pytree
@@ -275,11 +266,8 @@ class Scan:
     source: str
     instances: tuple[Instance, ...]
     background: Float[np.ndarray, "b 3"] = field(default_factory=lambda: np.zeros((0, 3)))
-    sensors: Float[np.ndarray, "s 3"] = (
-        field(  # where its sensors stood, in its frame, meters; none: not known
-            default_factory=lambda: np.zeros((0, 3))
-        )
-    )
+    # Where its sensors stood, in its frame, meters; none: not known.
+    sensors: Float[np.ndarray, "s 3"] = field(default_factory=lambda: np.zeros((0, 3)))
     skipped: tuple[Skipped, ...] = ()
     warnings: tuple[str, ...] = ()
 
@@ -363,7 +351,12 @@ class Repair:
     instances: tuple[int, ...] = ()  # of the scan, that are parts of it, the one that was matched first
     absorbed: tuple[str, ...] = ()  # ids that parts of it had in the scene before
     divided: str | None = None  # id of the other object that one mask, `instances`, held
-    share: float = 1.0  # of the part, that lies on the whole
+    # Points of one mask (of an earlier scan's without `instances`) that are floor or wall, or the neighbor's.
+    dropped: int = 0
+    neighbor: str | None = None  # id of the object that they are of
+    regained: int = 0  # points beside a mask that are the object's
+    points: int = 0  # of the mask, before
+    share: float = 1.0  # of the part, that lies on the whole; of points dropped or regained: beyond doubt
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -8,6 +8,7 @@ import time
 import numpy as np
 import pytest
 from factories import scene_object, turn_z
+from furnished import sheet
 from small_scenes import CONFIG, MARK, ROBUST, piece, scan
 
 from more2_jax.config import JointConfig, MeshingConfig, preset
@@ -290,3 +291,53 @@ def test_a_mask_that_holds_two_objects_is_divided_where_another_scan_shows_them_
     assert sum(len(o.points) for o in made.objects) == sum(len(i.points) for v in visits for i in v.instances)
     assert made.scans[merged_scan].instances == tuple(i.id for i in visits[merged_scan].instances)
     assert kept.changes[0].added or kept.changes[0].removed
+
+
+def furnished(name: str, seed: int) -> Scan:
+    """Two pieces a little over a floor: their undersides are seen, and no part of it."""
+    floor = sheet([-1.2, -1.2, -0.31], [5.0, 0, 0], [0, 2.4, 0], np.random.default_rng(seed))
+    return dataclasses.replace(scan(name, {0: (0.0, 0.0), 1: (0.3, 3.0)}), background=floor)
+
+
+def with_mask(s: Scan, points: np.ndarray, background: np.ndarray) -> Scan:
+    """The scan with another mask of its first instance."""
+    first, *others = s.instances
+    instances = (dataclasses.replace(first, points=points), *others)
+    return dataclasses.replace(s, instances=instances, background=background)
+
+
+@pytest.mark.parametrize("dirty_scan", [0, 1])
+def test_floor_in_a_mask_is_left_out_and_said_to_be(tiny_prior, dirty_scan):
+    visits = [furnished("a", 0), furnished("b", 4)]
+    dirty, own = visits[dirty_scan], visits[dirty_scan].instances[0].points
+    beside = (np.abs(dirty.background - [0.5, 0.3, -0.31]) < [0.2, 0.2, 0.03]).all(axis=1)
+    both = np.concatenate([own, dirty.background[beside]])
+    visits[dirty_scan] = with_mask(dirty, both, dirty.background[~beside])
+    made, kept = mended_and_kept(tiny_prior, visits)
+    left = points_of(made.objects[0], made.objects[0].observations[dirty_scan])
+    (repair,) = made.scans[dirty_scan].repairs
+    assert (repair.object, repair.instances, repair.points) == ("object_000", (10,), len(both))
+    assert repair.dropped == len(both) - len(left) > 0.9 * beside.sum() > 40
+    assert set(map(bytes, np.round(own, 6))) <= set(map(bytes, np.round(left, 6)))
+    assert not made.scans[1 - dirty_scan].repairs
+    assert len(points_of(kept.objects[0], kept.objects[0].observations[dirty_scan])) == len(both)
+    assert not any(s.repairs for s in kept.scans)
+
+
+@pytest.mark.parametrize("cut_scan", [0, 1])
+def test_what_was_cut_off_a_mask_comes_back_from_the_background(tiny_prior, cut_scan):
+    visits = [furnished("a", 0), furnished("b", 4)]
+    whole = visits[cut_scan].instances[0].points
+    lost = whole[:, 0] > 0.1
+    background = np.concatenate([visits[cut_scan].background, whole[lost]])
+    visits[cut_scan] = with_mask(visits[cut_scan], whole[~lost], background)
+    made, kept = mended_and_kept(tiny_prior, visits)
+    (repair,) = made.scans[1].repairs
+    assert repair.object == "object_000" and repair.regained > 0.9 * lost.sum() > 100
+    assert repair.instances == ((), (10,))[cut_scan]
+    counts = [
+        [len(points_of(s.objects[0], seen)) for seen in s.objects[0].observations] for s in (made, kept)
+    ]
+    assert counts[0][cut_scan] == counts[1][cut_scan] + repair.regained == (~lost).sum() + repair.regained
+    assert counts[0][1 - cut_scan] == counts[1][1 - cut_scan] == len(whole)
+    assert not any(s.repairs for s in kept.scans)

@@ -69,7 +69,7 @@ class Run:
     """Predicted masks (Mask3D) beside scans without their own: none, or one a scan in the same order."""
     reading: Reading = field(default_factory=Reading)
     keep_masks: bool = False
-    """Leave masks as they are: join no parts of one object, divide none that holds two."""
+    """Leave masks as they are: join no parts of one object, divide none that holds two, mend no borders."""
     config: Path | None = None
     """YAML with values that replace the preset's."""
     resume: bool = False

@@ -89,12 +89,25 @@ def repair_text(scan: ScanRecord, repair: Repair) -> str:
         if not repair.instances:
             return f"{scan.name}: one mask of the scan before held {both}"
         return f"{scan.name}: instance {repair.instances[0]} is {both} in one mask"
+    if repair.dropped or repair.regained:
+        return f"{scan.name}: {_border_text(repair)} ({repair.share:.0%} of them for sure)"
     sure = f"in parts ({repair.share:.0%} on it)"
     if repair.absorbed:
         return (
             f"{scan.name}: {_listed(repair.absorbed)} of the scan before and {repair.object} are one, {sure}"
         )
     return f"{scan.name}: instances {_listed(map(str, repair.instances))} are {repair.object}, {sure}"
+
+
+def _border_text(r: Repair) -> str:
+    """`40 of 900 points in the mask of object_002 (instance 3) are floor or wall, and left out`."""
+    mask = f"instance {r.instances[0]}" if r.instances else "in an earlier scan"
+    if r.regained:
+        return (
+            f"{r.regained} points beside the {r.points} of {r.object} ({mask}) are part of it, and taken in"
+        )
+    whose = f"{r.neighbor}'s" if r.neighbor else "floor or wall"
+    return f"{r.dropped} of {r.points} points of {r.object} ({mask}) are {whose}, and left out"
 
 
 def _listed(names: Iterable[str]) -> str:

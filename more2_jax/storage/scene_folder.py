@@ -280,8 +280,8 @@ def _embeddings(path: Path) -> dict[str, Embedding]:
 
 
 def _repair(content: dict[str, Any]) -> Repair:
-    lists = {k: tuple(content[k]) for k in ("instances", "absorbed")}
-    return Repair(object=content["object"], **lists, divided=content.get("divided"), share=content["share"])
+    lists: dict[str, Any] = {k: tuple(content[k]) for k in ("instances", "absorbed")}
+    return Repair(**(content | lists))
 
 
 def _frame(content: dict[str, Any] | None) -> Frame:

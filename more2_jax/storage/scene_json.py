@@ -68,8 +68,9 @@ def _where_any(**lists: list[Any]) -> dict[str, list[Any]]:
 
 def _repair_to_json(r: Repair) -> dict[str, Any]:
     lists = {"instances": [int(i) for i in r.instances], "absorbed": list(r.absorbed)}
-    divided = {} if r.divided is None else {"divided": r.divided}
-    return {"object": r.object, **lists, **divided, "share": float(r.share)}
+    others = {k: getattr(r, k) for k in ("divided", "dropped", "neighbor", "regained", "points")}
+    told = {k: v for k, v in others.items() if v}  # older readers know no others
+    return {"object": r.object, **lists, **told, "share": float(r.share)}
 
 
 def _frame_to_json(frame: Frame, upright: bool) -> dict[str, Any]:

@@ -25,6 +25,7 @@ from more2_jax.network.prior import Prior
 from more2_jax.tracking.divisions import Division, Part, Wholes, chosen
 from more2_jax.tracking.identify import Found, Identified
 from more2_jax.tracking.objects import place_of
+from more2_jax.tracking.room_points import some_points
 from more2_jax.tracking.split_masks import reach_m
 from more2_jax.types import Embedding, Instance, ObservedObject, Repair, SceneObject
 
@@ -267,10 +268,7 @@ def larger_first(side: Rows) -> tuple[Rows, Rows]:
 
 def part_of_instance(instance: Instance, part: Part) -> Instance:
     """One half of an instance, with its id."""
-    per_point = {name: getattr(instance, name) for name in ("points", "colors", "normals")}
-    return dataclasses.replace(
-        instance, **{name: None if x is None else x[part.rows] for name, x in per_point.items()}
-    )
+    return some_points(instance, part.rows)
 
 
 def part_of_object(o: SceneObject, part: Part) -> SceneObject:

@@ -346,6 +346,9 @@ def test_mended_masks_are_listed():
         Repair(object="object_000", absorbed=("object_007",), share=0.8),
         Repair(object="object_000", instances=(4,), divided="object_001"),
         Repair(object="object_000", divided="object_008"),
+        Repair(object="object_000", instances=(4,), dropped=40, points=900, share=0.95),
+        Repair(object="object_002", dropped=7, neighbor="object_003", points=90, share=0.5),
+        Repair(object="object_001", instances=(3,), regained=1200, points=3000, share=0.75),
     )
     mended = dataclasses.replace(SCENE.scans[-1], repairs=repairs)
     text = report_html(dataclasses.replace(SCENE, scans=(*SCENE.scans[:-1], mended)), CONFIG)
@@ -353,4 +356,9 @@ def test_mended_masks_are_listed():
     assert "object_007 of the scan before and object_000 are one, in parts (80% on it)" in text
     assert "friday: instance 4 is object_000 and object_001 in one mask" in text
     assert "friday: one mask of the scan before held object_000 and object_008" in text
+    assert (
+        "40 of 900 points of object_000 (instance 4) are floor or wall, and left out (95% of them for" in text
+    )
+    assert "7 of 90 points of object_002 (in an earlier scan) are object_003" in text
+    assert "1200 points beside the 3000 of object_001 (instance 3) are part of it, and taken in (75%" in text
     assert "Masks are as they were given." in report_html(SCENE, CONFIG)

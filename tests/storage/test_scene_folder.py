@@ -19,7 +19,7 @@ from places import ROOT
 import more2_jax
 from more2_jax.config import preset
 from more2_jax.storage.scene_folder import check_output, load_scene, save_scene, stored_at
-from more2_jax.types import Anchors, Frame
+from more2_jax.types import Anchors, Frame, Repair
 
 CONFIG = preset("robust", upright=True)
 
@@ -118,6 +118,30 @@ def test_folder_satisfies_the_schema(tmp_path):
     }
     listed = {o[k] for o in content["objects"] for k in ("mesh", "points")} - {None}
     assert names == listed | {"scene.json", "embeddings.npz", "report.html", "run.log", "config.yaml"}
+
+
+@pytest.mark.parametrize(
+    "repair",
+    [
+        Repair(object="object_001", instances=(3, 5), share=0.9),
+        Repair(object="object_001", absorbed=("object_007",), share=0.9),
+        Repair(object="object_001", instances=(3,), divided="object_002"),
+        Repair(object="object_001", instances=(3,), dropped=4, points=90, share=0.75),
+        Repair(object="object_001", dropped=4, neighbor="object_002", points=90, share=0.75),
+        Repair(object="object_001", instances=(3,), regained=12, points=90, share=0.75),
+    ],
+)
+def test_what_was_mended_comes_back_and_only_what_is_said_of_it_is_written(tmp_path, repair):
+    scene = living_scene()
+    scans = (*scene.scans[:2], dataclasses.replace(scene.scans[2], repairs=(repair,)))
+    save_scene(dataclasses.replace(scene, scans=scans), tmp_path / "scene", CONFIG)
+    assert load_scene(tmp_path / "scene")[0].scans[2].repairs == (repair,)
+    content = json.loads((tmp_path / "scene" / "scene.json").read_text())
+    schema = json.loads((Path(more2_jax.__file__).parent / "assets/scene.schema.json").read_text())
+    jsonschema.validate(content, schema)
+    (written,) = content["scans"][2]["repairs"]
+    said = {k for k in ("divided", "dropped", "neighbor", "regained", "points") if getattr(repair, k)}
+    assert set(written) == {"object", "instances", "absorbed", "share", *said}
 
 
 def test_a_page_is_stored_as_given_and_never_outlives_its_scene(tmp_path):
