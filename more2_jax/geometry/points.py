@@ -103,7 +103,7 @@ def nearest_index(
     rows = (b, b_mask, jnp.arange(len(b), dtype=jnp.int32))
     blocks = [jnp.pad(x, ((0, -len(b) % at_once), *[(0, 0)] * (x.ndim - 1))) for x in rows]
     blocks = [x.reshape(-1, at_once, *x.shape[1:]) for x in blocks]
-    best, _ = jax.lax.scan(nearer, jnp.full(len(a), last, jnp.int32), tuple(blocks))
+    best, _ = jax.lax.scan(nearer, jnp.full(len(a), last, jnp.int32), (blocks[0], blocks[1], blocks[2]))
     return jnp.minimum(best & low, len(b) - 1)
 
 

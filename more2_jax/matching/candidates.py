@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import jax
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from more2_jax.config import EvidenceMatcher, MotionModel, SurfaceSearch
 from more2_jax.geometry.poses import Pose
@@ -82,24 +82,20 @@ def align_candidates(
     among = proposed(proposal_of(known, matcher), matcher.candidates)
     rows = np.argwhere(among)[:, ::-1]
     sides = local_batch(new), local_batch(old)
-    real = [side.take(np.arange(n)) for side, n in zip(sides, (len(new), len(old)), strict=True)]
-    ready = [alignable(side, matcher.search) for side in real]
+    ready = [
+        alignable(b.take(np.arange(len(s))), matcher.search) for b, s in zip(sides, (new, old), strict=True)
+    ]
     pairs = paired_rows(*sides, rows, np.eye(4) if T_scene_scan is None else T_scene_scan)
-    instances, objects = (
-        jax.tree.map(lambda x, at=at: x[at], s) for s, at in zip(ready, rows.T, strict=True)
-    )
-    found = search_poses(instances, objects, pairs.stayed, matcher.search, motion)
-    off, own = np.zeros((*found.cost.shape, 2)), np.zeros(len(rows))
-    if asks_prior(matcher.search, motion):
-        found, off = off_completed_surfaces(prior, instances, objects, found, matcher.search)
-        own = np.max([off_own_surface(prior, x)[at] for x, at in zip(ready, rows.T, strict=True)], axis=0)
+    objects = taken(ready[0], rows[:, 0]), taken(ready[1], rows[:, 1])
+    found = search_poses(*objects, pairs.stayed, matcher.search, motion)
+    found, off, own = told_by_prior(prior, ready, rows, found, matcher.search, motion)
     T_old_new = pairs.to_world(found.poses)
     seen = (seen or seen_in(old, new)) if motion == "upright" else None
     metric = metric_evidence((new, old), sides, tuple(ready), rows, T_old_new, seen)  # type: ignore[arg-type]
     return AlignedPairs(
         among=among,
         pairs=pairs,
-        objects=(instances, objects),
+        objects=objects,
         found=found,
         T_old_new=T_old_new,
         seen=seen,
@@ -110,6 +106,31 @@ def align_candidates(
         off_own=own,
         height_m=0.0 if T_scene_scan is None else float(T_scene_scan[2, 3]),
     )
+
+
+def told_by_prior(
+    prior: Prior,
+    ready: Sequence[AlignableObject],
+    rows: Int[np.ndarray, "p 2"],
+    found: FoundPoses,
+    search: SurfaceSearch,
+    motion: MotionModel,
+) -> tuple[FoundPoses, Float[np.ndarray, "p k 2"], Float[np.ndarray, " p"]]:
+    """Where the prior is asked: poses in its order, how far both clouds lie off completed surfaces, and off their own.
+
+    Elsewhere the poses as they are, and zeros.
+    """
+    if not asks_prior(search, motion):
+        return found, np.zeros((*found.cost.shape, 2)), np.zeros(len(found.cost))
+    sides = list(zip(ready, rows.T, strict=True))
+    source, target = (taken(x, at) for x, at in sides)
+    found, off = off_completed_surfaces(prior, source, target, found, search)
+    return found, off, np.max([off_own_surface(prior, x)[at] for x, at in sides], axis=0)
+
+
+def taken(objects: AlignableObject, rows: Int[np.ndarray, " p"]) -> AlignableObject:
+    """The objects in `rows`, in that order."""
+    return jax.tree.map(lambda x: x[rows], objects)
 
 
 def check_asked(

@@ -80,7 +80,8 @@ def metric_evidence(
         ]
         others = np.repeat(pairs[:, 1 - way], T_old_new.shape[1])
         apart[..., way] = np.reshape(
-            [mean_apart(trees[1 - way][o], p) for o, p in zip(others, moved, strict=True)], apart.shape[:2]
+            [mean_apart(trees[1 - way][int(o)], p) for o, p in zip(others, moved, strict=True)],
+            apart.shape[:2],
         )
         if seen is not None:
             ends = np.cumsum([len(p) for p in moved])[:-1]
