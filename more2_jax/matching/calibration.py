@@ -64,18 +64,16 @@ UPRIGHT = Calibration(
     raised=2.0,
 )
 FREE = Calibration(
-    intercept=6.9,
+    intercept=7.7,
     likeness=3.0,
-    apart_less=-9.2,
-    apart_more=-1.1,
-    off_less=-7.2,
-    off_more=-8.3,
-    raised=2.0,
+    apart_less=-7.1,
+    apart_more=-1.3,
+    off_less=-10.0,
+    off_more=-11.2,
+    raised=2.5,
 )
-
-
 # Without the prior's say.
-UNASKED = Calibration(intercept=6.4, likeness=3.0, apart_less=-9.2, apart_more=-6.0, raised=2.0)
+UNASKED = Calibration(intercept=3.7, likeness=5.8, apart_less=-6.3, apart_more=-6.1, raised=3.0)
 
 
 def calibrated(
