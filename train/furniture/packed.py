@@ -14,6 +14,12 @@ from train.furniture.source_mesh import SourceMesh, name_digest
 LEVELS = 65535.0  # of a packed coordinate
 NEEDED = {"vertices", "faces", "names", "n_vertices", "n_faces", "lo", "hi"}
 INFINIGEN_LICENSE = "output of Infinigen's generators (BSD-3-Clause)"
+# Of collections that say no licenses, by how the last part of a mesh's name begins.
+LICENSES = {
+    "kaykit_": "CC0-1.0, Kay Lousberg (KayKit)",
+    "cob_": "Apache-2.0, ipa320/cob_simulation; meshes merged, rescaled, centered and quantized",
+    "aws_": "MIT-0, Amazon.com, Inc. or its affiliates (aws-robomaker-bookstore-world)",
+}
 
 
 def write_packed(path: str | Path, meshes: Sequence[SourceMesh]) -> None:
@@ -57,7 +63,7 @@ def read_packed(path: Path) -> Iterator[SourceMesh]:
     categories = arrays.get("categories", [path.stem.removeprefix("infinigen_")] * len(vertices))
     licenses = arrays.get("licenses", arrays.get("licences"))
     if licenses is None:
-        licenses = [INFINIGEN_LICENSE if infinigen else "unknown"] * len(vertices)
+        licenses = [INFINIGEN_LICENSE if infinigen else license_of(str(n)) for n in arrays["names"]]
     rows = zip(
         arrays["names"], categories, licenses, vertices, faces, arrays["lo"], arrays["hi"], strict=True
     )
@@ -78,3 +84,9 @@ def _in_meters(name: str, vertices: Float[np.ndarray, "v 3"]) -> Float[np.ndarra
         return vertices
     share = name_digest(name) % 1000 / 999
     return vertices * ((0.25 + 0.45 * share) / np.ptp(vertices[:, 2]))
+
+
+def license_of(name: str) -> str:
+    """The license of a mesh whose collection says none, by its name."""
+    last = name.rsplit("/", 1)[-1]
+    return next((text for start, text in LICENSES.items() if last.startswith(start)), "unknown")
