@@ -12,7 +12,6 @@ from more2_jax.geometry.poses import Points, Pose, apply_pose
 from more2_jax.geometry.voxels import voxel_means, voxel_normals
 
 # Chosen on rooms of regime `real` (fused at 2 to 3 cm, walls 1 to 3 cm thick): `eval.segmentation`, seed 404.
-VOXEL_M = 0.03
 NEIGHBORS = 20  # of a voxel's normal
 NEAR_M = 0.07  # off the other scan's surface: drift and noise of both; less has not changed
 SPACING_M = 0.06  # along that surface: between its points
@@ -20,6 +19,7 @@ MOST_SPACING_M = 0.25  # farther off, no surface is continued
 CONTINUED_BY = 8  # nearest points, by the tangent planes of which it is
 EMPTY_FROM_M, EMPTY_TO_M, EMPTY_STEP_M = 0.1, 1.5, 0.05  # before a surface, where nothing else stands
 BLOCKED_M = 0.06  # a surface this near to the line ends what is empty
+KEPT_M = 0.03  # one of such points in a cube of this side is enough
 REACH_M = 0.06  # of a point that is known to be empty
 
 STAYED, EMPTIED, UNKNOWN = 0, 1, 2  # states of a voxel
@@ -45,9 +45,9 @@ class Surface:
     tree: KDTree
 
 
-def surface_of(scan: UnlabeledScan) -> Surface:
+def surface_of(scan: UnlabeledScan, voxel_m: float) -> Surface:
     """The voxels of a scan that is not empty. Raises ValueError for one too wide for their grid."""
-    points, voxel_of = voxel_means(scan.points, VOXEL_M)
+    points, voxel_of = voxel_means(scan.points, voxel_m)
     normals = voxel_normals(points, NEIGHBORS)
     middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
     seen_from = scan.sensors.mean(axis=0) if scan.sensors is not None and len(scan.sensors) else middle
@@ -78,7 +78,7 @@ def empty_before(surface: Surface) -> Points:
         open_ = open_[clear]
         found.append(at[clear])
     points = np.concatenate(found)
-    return voxel_means(points, VOXEL_M)[0] if len(points) else points
+    return voxel_means(points, KEPT_M)[0] if len(points) else points
 
 
 def states(surface: Surface, other: Surface, T_other_scan: Pose, empty: Points) -> Int8[np.ndarray, " v"]:

@@ -96,7 +96,7 @@ def segment_changes(
             " scans need two or more, none empty"
         )
     poses = one_frame([s.points for s in scans])
-    surfaces = [surface_of(s) for s in scans]
+    surfaces = [surface_of(s, config.clusters.voxel_m) for s in scans]
     empty = [empty_before(s) for s in surfaces]
     found = []
     for k, surface in enumerate(surfaces):
