@@ -53,7 +53,7 @@ class RoomFit:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Shape:
+class RoomShape:
     """A scan at even spacing."""
 
     points: Points
@@ -61,7 +61,7 @@ class _Shape:
     tree: KDTree
 
 
-def _refined(a: _Shape, b: _Shape, T_a_b: Pose, reaches_m: Sequence[float]) -> Pose:
+def _refined(a: RoomShape, b: RoomShape, T_a_b: Pose, reaches_m: Sequence[float]) -> Pose:
     """The pose after ICP."""
     rows = slice(None, None, max(1, -(-len(b.points) // MOST_VOXELS)))
     points, normals = b.points[rows], b.normals[rows]
@@ -71,7 +71,7 @@ def _refined(a: _Shape, b: _Shape, T_a_b: Pose, reaches_m: Sequence[float]) -> P
     return T_a_b
 
 
-def _step(a: _Shape, points: Points, normals: Points, reach_m: float) -> Pose:
+def _step(a: RoomShape, points: Points, normals: Points, reach_m: float) -> Pose:
     """The motion that takes the points closer to the tangent planes of what they lie nearest."""
     distance, near = map(np.asarray, a.tree.query(points, distance_upper_bound=reach_m))
     near = np.minimum(near, len(a.points) - 1)
@@ -94,42 +94,48 @@ def _step(a: _Shape, points: Points, normals: Points, reach_m: float) -> Pose:
     return T
 
 
-def align_rooms(a: Points, b: Points) -> RoomFit | None:
-    """`T_a_b` of two scans (meters) that show one room; None where no pose fits, or two fit that differ.
+def align_rooms(a: RoomShape, b: RoomShape) -> RoomFit | None:
+    """`T_a_b` of two scans that show one room: as they are given, else from any yaw."""
+    return fit_as_given(a, b) or fit_from_any_yaw(a, b)
 
-    As they are given, they may be off by about 0.3 m and 5°. Beyond that z must be up to about 10°, and floors seen.
-    Raises ValueError for a cloud too wide for the voxel grid.
+
+def room_shape(points: Points) -> RoomShape | None:
+    """What is compared of a scan (meters); None for one too small to tell. Raises ValueError where it is too wide."""
+    if not len(points):
+        return None
+    voxels, _ = voxel_means(points, VOXEL_M)
+    if len(voxels) < LEAST_VOXELS:
+        return None
+    return RoomShape(points=voxels, normals=voxel_normals(voxels, NEIGHBORS), tree=KDTree(voxels))
+
+
+def fit_as_given(a: RoomShape, b: RoomShape) -> RoomFit | None:
+    """`T_a_b` of scans whose frames are one to about 0.3 m and 5°; None where they do not fit."""
+    given = _fit(a, b, np.eye(4))
+    return given if given.share >= FITS else None
+
+
+def fit_from_any_yaw(a: RoomShape, b: RoomShape) -> RoomFit | None:
+    """`T_a_b` of scans whose z is up to about 10°, and whose floors are seen, wherever they lie.
+
+    None where no pose fits, or two fit that differ.
     """
-    if not min(len(a), len(b)):
-        return None
-    first, second = _shape(a), _shape(b)
-    if min(len(s.points) for s in (first, second)) < LEAST_VOXELS:
-        return None
-    given = _fit(first, second, np.eye(4))
-    if given.share >= FITS:
-        return given
-    rough = [_fit(first, _fewer(second), T, REACHES_M[:2]) for T in _begun(first, second)]
+    rough = [_fit(a, _fewer(b), T, REACHES_M[:2]) for T in _begun(a, b)]
     most = max((f.share for f in rough), default=0.0)
-    fits = [_fit(first, second, f.T_a_b, REACHES_M[1:]) for f in rough if f.share >= max(FITS, most) / 2]
+    fits = [_fit(a, b, f.T_a_b, REACHES_M[1:]) for f in rough if f.share >= max(FITS, most) / 2]
     fits = sorted((f for f in fits if f.share >= FITS), key=lambda f: -f.closeness)
-    others = (f for f in fits[1:] if _apart_m(fits[0], f, second.points) > DIFFERENT_M)
+    others = (f for f in fits[1:] if _apart_m(fits[0], f, b.points) > DIFFERENT_M)
     rival = next(others, None)
     return fits[0] if fits and (rival is None or rival.closeness < CLEARLY * fits[0].closeness) else None
 
 
-def _shape(points: Points) -> _Shape:
-    """Of a cloud, what is compared."""
-    voxels, _ = voxel_means(points, VOXEL_M)
-    return _Shape(points=voxels, normals=voxel_normals(voxels, NEIGHBORS), tree=KDTree(voxels))
-
-
-def _fewer(s: _Shape) -> _Shape:
+def _fewer(s: RoomShape) -> RoomShape:
     """At most `ROUGH_VOXELS` of them, at even steps."""
     rows = slice(None, None, -(-len(s.points) // ROUGH_VOXELS))
-    return _Shape(points=s.points[rows], normals=s.normals[rows], tree=KDTree(s.points[rows]))
+    return RoomShape(points=s.points[rows], normals=s.normals[rows], tree=KDTree(s.points[rows]))
 
 
-def _fit(a: _Shape, b: _Shape, T_a_b: Pose, reaches_m: Sequence[float] = REACHES_M) -> RoomFit:
+def _fit(a: RoomShape, b: RoomShape, T_a_b: Pose, reaches_m: Sequence[float] = REACHES_M) -> RoomFit:
     """The pose after ICP, and how well it fits: by the scan that has less which the other lacks."""
     T_a_b = _refined(a, b, T_a_b, reaches_m)
     shares = [_on_other(a, b, T_a_b), _on_other(b, a, np.linalg.inv(T_a_b))]
@@ -138,7 +144,7 @@ def _fit(a: _Shape, b: _Shape, T_a_b: Pose, reaches_m: Sequence[float] = REACHES
     )
 
 
-def _on_other(a: _Shape, b: _Shape, T_a_b: Pose) -> tuple[float, float]:
+def _on_other(a: RoomShape, b: RoomShape, T_a_b: Pose) -> tuple[float, float]:
     """Over the three directions that b's normals gather about, the least share of voxels that lie on a; and the
     share of all that lie on it closely.
 
@@ -166,7 +172,7 @@ def _apart_m(f: RoomFit, g: RoomFit, points: Points) -> float:
 # --- from any yaw ---------------------------------------------------------------------------------------------
 
 
-def _begun(a: _Shape, b: _Shape) -> Iterator[Pose]:
+def _begun(a: RoomShape, b: RoomShape) -> Iterator[Pose]:
     """Poses to begin from: leveled, walls parallel, and where most of what stands lies over what stands."""
     up = [gravity(s.points) for s in (a, b)]
     if None in up:

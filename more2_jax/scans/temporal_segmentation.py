@@ -7,7 +7,7 @@ clustered as in `geometric_segmentation`.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -17,7 +17,13 @@ from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 from scipy.spatial import KDTree
 
 from more2_jax.geometry.poses import Points, Pose
-from more2_jax.geometry.room_alignment import align_rooms
+from more2_jax.geometry.room_alignment import (
+    RoomFit,
+    RoomShape,
+    fit_as_given,
+    fit_from_any_yaw,
+    room_shape,
+)
 from more2_jax.scans.geometric_segmentation import (
     Segmentation,
     SegmentationConfig,
@@ -85,7 +91,7 @@ def segment_changes(
 ) -> tuple[TemporalSegmentation, ...]:
     """Cuts scans of one room, each into instances of its own, by what changed between them.
 
-    Scans lie in any frames: as given where they fit, else leveled and turned until they do (`align_rooms`). Ids are
+    Scans lie in any frames: as given where they fit, else leveled and turned until they do (`one_frame`). Ids are
     those of one scan: who is who is left to matching. What a scan did not look at is no change.
     Raises ValueError for fewer than two scans, an empty one, one that fits no other, and one too wide for the grid.
     """
@@ -110,26 +116,33 @@ def segment_changes(
 
 
 def one_frame(clouds: Sequence[Points]) -> list[Pose]:
-    """`T_first_scan` of every scan, by the first or another that is placed already.
+    """`T_first_scan` of every scan (meters), by the first or another that is placed already.
 
+    Frames as they are given are believed wherever they fit; only scans left over are turned.
     Raises ValueError where one fits none of the placed ones.
     """
+    shapes = [room_shape(p) for p in clouds]
     poses: dict[int, Pose] = {0: np.eye(4)}
-    left = list(range(1, len(clouds)))
-    while left:
-        for k in left:
-            # The latest first: scans that follow one another have most in common.
-            fits = ((j, align_rooms(clouds[j], clouds[k])) for j in sorted(poses, key=lambda j: abs(j - k)))
-            if (best := next(((j, f) for j, f in fits if f is not None), None)) is not None:
-                poses[k] = poses[best[0]] @ best[1].T_a_b
-                left.remove(k)
-                break
-        else:
+    ways = (fit_as_given, fit_from_any_yaw)
+    while len(poses) < len(clouds):
+        left = [k for k in range(len(clouds)) if k not in poses]
+        # The nearest in time first: scans that follow one another have most in common.
+        pairs = [(j, k) for k in left for j in sorted(poses, key=lambda j: abs(j - k))]
+        fits = ((j, k, _placed(way, shapes[j], shapes[k])) for way in ways for j, k in pairs)
+        if (found := next(((j, k, f) for j, k, f in fits if f is not None), None)) is None:
             raise ValueError(
                 f"scan {left[0] + 1} of {len(clouds)} does not lie on the others in any one pose; changes between"
                 " scans need scans that show the same floor and walls, each with z up or all in one frame"
             )
+        j, k, fit = found
+        poses[k] = poses[j] @ fit.T_a_b
     return [poses[k] for k in range(len(clouds))]
+
+
+def _placed(
+    way: Callable[[RoomShape, RoomShape], RoomFit | None], a: RoomShape | None, b: RoomShape | None
+) -> RoomFit | None:
+    return None if a is None or b is None else way(a, b)
 
 
 def together(said: Sequence[Int8[np.ndarray, " v"]]) -> Int8[np.ndarray, " v"]:
