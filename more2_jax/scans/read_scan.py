@@ -55,11 +55,7 @@ def read_scan(
     """
     path = Path(path)
     check_unit(unit)
-    if segment not in (None, "geometric"):
-        raise ValueError(
-            f"{path}: segment {segment!r} of one scan; needed geometric or None (changes are between scans: more2 run"
-            " with two or more, or read_changed_scans)"
-        )
+    _check_alone(path, segment)
     masks = None if masks is None else Path(masks)
     needed = segment is None and masks is None
     options = ReadOptions(
@@ -71,6 +67,14 @@ def read_scan(
     if segment is not None:
         cloud = _segmented(path, cloud, unit)
     return scan_of(path, cloud, unit, min_points)
+
+
+def _check_alone(path: Path, segment: str | None) -> None:
+    if segment not in (None, "geometric"):
+        raise ValueError(
+            f"{path}: segment {segment!r} of one scan; needed geometric or None (changes are between scans: more2 run"
+            " with two or more, or read_changed_scans)"
+        )
 
 
 def _segmented(path: Path, cloud: LabeledCloud, unit: str) -> LabeledCloud:
