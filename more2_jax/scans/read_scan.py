@@ -46,8 +46,7 @@ def read_scan(
     beside it may hold the places of its sensors. Instance ids ≤ 0 are background. `unit` is the file's: m, cm or
     mm. Instances of fewer than `min_points` points are reported in `Scan.skipped`; sizes that look like another
     unit, in `Scan.warnings`. `masks` are predicted ones (`data.masks`): those scored `min_score` or more replace
-    the scan's own. `segment="geometric"` cuts a cloud without instances into planes and clusters
-    ("changes" is refused: `read_changed_scans` takes several scans); `depth_frames`
+    the scan's own. `segment="geometric"` cuts a cloud without instances into planes and clusters; `depth_frames`
     reads the raw depth of 3RScan (paper §4). Normals are the file's, else those of its faces.
 
     Raises ValueError, in one line, when the file is missing, unknown, damaged, has no instance property, has
