@@ -34,6 +34,7 @@ _HOMES = {
     "meshing.extract": ("extract_mesh",),
     "refinement.joint": ("fit_jointly",),
     "scene": ("add_scan", "reconstruct", "start_scene"),
+    "scans.read_changed_scans": ("read_changed_scans",),
     "scans.read_scan": ("read_scan",),
     "storage.scene_folder": ("load_scene", "save_scene"),
 }
@@ -50,6 +51,7 @@ if TYPE_CHECKING:
     from more2_jax.registration.older_calls import world_pose
     from more2_jax.registration.pair_batch import PairBatch, batch_of, local_batch, observe, pair_up
     from more2_jax.registration.register_pairs import register
+    from more2_jax.scans.read_changed_scans import read_changed_scans
     from more2_jax.scans.read_scan import read_scan
     from more2_jax.scene import add_scan, reconstruct, start_scene
     from more2_jax.storage.scene_folder import load_scene, save_scene
@@ -97,6 +99,7 @@ __all__ = [
     "pad_clouds",
     "pair_up",
     "preset",
+    "read_changed_scans",
     "read_scan",
     "reconstruct",
     "register",

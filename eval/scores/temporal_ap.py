@@ -81,7 +81,7 @@ def masks_of(
     predicted: list[dict[int, np.ndarray]] = [{} for _ in tracks]
     truths: list[dict[int, np.ndarray]] = [{} for _ in scene.objects]
     for k, scan in enumerate(scene.scans):
-        clouds = [*(i.points for i in scan.instances), *true[k].values()]
+        clouds = [*(i.points for i in scan.instances), scan.background, *true[k].values()]
         places = np.unique(np.concatenate(clouds), axis=0) if clouds else np.zeros((0, 3))
         tree = KDTree(places)
         for track, masks in zip(tracks, predicted, strict=True):

@@ -49,8 +49,7 @@ def run_scans(
     _check_log(reporting, out)
     with Session(reporting) as session:
         session.log(f"settings: preset {config.preset}, prior {prior_name}, upright {config.upright}")
-        pairs = zip(paths, masks or [None] * len(paths), strict=True)
-        scans = [read(session, path, config, reading, mask) for path, mask in pairs]
+        scans = read_all(session, paths, config, reading, masks or [None] * len(paths))
         keep_compiled_programs()
         prior = load_prior(prior_name)
         begun = _begun(session, out, scans, config, prior) if resume else None
@@ -163,7 +162,8 @@ def add(
     check_output(folder)
     _check_log(reporting, folder)
     with Session(reporting, steps=_stages_of_add(config) + 2) as session:
-        scan = read(session, path, config, reading, masks)
+        earlier = [_last_source(folder, scene)] if reading.segment == "changes" else []
+        (scan,) = read_all(session, [path], config, reading, [masks], earlier)
         keep_compiled_programs()
         prior = _same_prior(scene, prior_name)
         scene = add_scan(prior, scene, scan, config, progress=session.watch)
@@ -202,17 +202,53 @@ def _same_prior(scene: LivingScene, name: str | None) -> Prior:
     return prior
 
 
+def _last_source(folder: Path, scene: LivingScene) -> Path:
+    """The file of a stored scene's last scan: what a new one is compared with."""
+    source = Path(scene.scans[-1].source)
+    if not source.exists():
+        raise ValueError(
+            f"{folder}: its last scan was read from {source}, where nothing is now; --segment changes needs it to"
+            " compare with (--segment geometric does not)"
+        )
+    return source
+
+
+def read_all(
+    session: Session,
+    paths: Sequence[Path],
+    config: SceneConfig,
+    reading: Reading,
+    masks: Sequence[Path | None],
+    earlier: Sequence[Path] = (),
+) -> list[Scan]:
+    """Reads scans and says what they hold; with `--segment changes` together, and with `earlier` ones of the room."""
+    if reading.segment != "changes":
+        return [read(session, path, config, reading, mask) for path, mask in zip(paths, masks, strict=True)]
+    from more2_jax.scans.read_changed_scans import read_changed_scans
+
+    options = dataclasses.asdict(reading)
+    del options["segment"]
+    scans = read_changed_scans(paths, earlier=earlier, masks=masks, min_points=config.min_points, **options)
+    for scan in scans:
+        _say_read(session, scan)
+    return list(scans)
+
+
 def read(session: Session, path: Path, config: SceneConfig, reading: Reading, masks: Path | None) -> Scan:
     """Reads one scan and says what it holds and what was left out."""
     from more2_jax.scans.read_scan import read_scan
 
     scan = read_scan(path, min_points=config.min_points, masks=masks, **dataclasses.asdict(reading))
+    _say_read(session, scan)
+    return scan
+
+
+def _say_read(session: Session, scan: Scan) -> None:
     for warning in scan.warnings:
         session.warn(f"{scan.name}: {warning}")
     session.say(f"read {scan.source}: {len(scan.instances)} instances")
     for skipped in scan.skipped:
         session.say(f"  skipped {skipped.what}: {skipped.reason}")
-    return scan
 
 
 def tell(session: Session, scene: LivingScene) -> None:

@@ -17,8 +17,9 @@ class Reading:
     """Unit of the scans' coordinates."""
     instance_property: str | None = None
     """Property of the points that names the instance, where it is none of the usual."""
-    segment: Literal["geometric"] | None = None
-    """geometric: cut a scan without masks into planes and clusters; masks from a network are better."""
+    segment: Literal["changes", "geometric"] | None = None
+    """How to cut scans without masks. changes: by what changed between two or more scans of one room. geometric: one
+    scan alone into planes and clusters. Masks from a network are better."""
     depth_frames: bool = False
     """Points from the raw depth of a 3RScan folder rather than from its mesh."""
 

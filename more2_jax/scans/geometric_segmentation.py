@@ -10,9 +10,8 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
+from more2_jax.geometry.voxels import voxel_means, voxel_normals
 from more2_jax.types import Skipped
-
-LARGEST_GRID = 2**20  # voxels along an axis
 
 
 @dataclass(frozen=True)
@@ -82,37 +81,14 @@ def segment_geometric(points: Float[np.ndarray, "n 3"], config: SegmentationConf
     """
     if not len(points):
         return Segmentation(instance=np.zeros(0, np.int64), planes=(), skipped=())
-    voxels, voxel_of = _voxels(points, config.voxel_m)
-    normals = _normals(voxels, config.normal_neighbors)
-    planes, structure = _planes(voxels, normals, config)
+    voxels, voxel_of = voxel_means(points, config.voxel_m)
+    normals = voxel_normals(voxels, config.normal_neighbors)
+    planes, structure = boundary_planes(voxels, normals, config)
     cluster = np.full(len(voxels), -1)
-    cluster[~structure] = _clusters(voxels[~structure], np.bincount(voxel_of)[~structure], config)
-    cluster = _without_flat(voxels, _joined(voxels, cluster, config), planes, config)
-    instance, skipped = _numbered(voxels, cluster, voxel_of, config)
+    cluster[~structure] = density_clusters(voxels[~structure], np.bincount(voxel_of)[~structure], config)
+    cluster = without_flat(voxels, small_joined(voxels, cluster, config), planes, config)
+    instance, skipped = numbered(voxels, cluster, voxel_of, config)
     return Segmentation(instance=instance, planes=planes, skipped=skipped)
-
-
-def _voxels(
-    points: Float[np.ndarray, "n 3"], size_m: float
-) -> tuple[Float[np.ndarray, "v 3"], Integer[np.ndarray, "n"]]:
-    """Centroids of the occupied voxels, in an order that does not depend on the points', and whose is whose."""
-    low = points.min(axis=0)
-    extent = float((points.max(axis=0) - low).max())
-    if extent > size_m * LARGEST_GRID:
-        raise ValueError(f"the cloud measures {extent:.4g} m; needed at most {size_m * LARGEST_GRID:.4g} m")
-    cell = np.floor((points - low) / size_m).astype(np.int64)
-    key = (cell[:, 0] << 42) + (cell[:, 1] << 21) + cell[:, 2]
-    _, voxel_of, count = np.unique(key, return_inverse=True, return_counts=True)
-    sums = [np.bincount(voxel_of, points[:, axis]) for axis in range(3)]
-    return np.stack(sums, axis=-1) / count[:, None], voxel_of
-
-
-def _normals(voxels: Float[np.ndarray, "v 3"], neighbors: int) -> Float[np.ndarray, "v 3"]:
-    """Direction of least spread among the nearest voxels; its sign means nothing."""
-    k = min(neighbors, len(voxels))
-    near = KDTree(voxels).query(voxels, k=k)[1].reshape(len(voxels), k)
-    centered = voxels[near] - voxels[near].mean(axis=1, keepdims=True)
-    return np.linalg.eigh(np.einsum("vki,vkj->vij", centered, centered))[1][:, :, 0]
 
 
 def _extent(points: Float[np.ndarray, "n 3"]) -> float:
@@ -126,7 +102,7 @@ def _extent(points: Float[np.ndarray, "n 3"]) -> float:
 # --- planes -------------------------------------------------------------------------------------------------
 
 
-def _planes(
+def boundary_planes(
     voxels: Float[np.ndarray, "v 3"], normals: Float[np.ndarray, "v 3"], config: SegmentationConfig
 ) -> tuple[tuple[Plane, ...], Bool[np.ndarray, "v"]]:
     """The largest planes one after the other, and the voxels on or beyond those that are structure."""
@@ -218,7 +194,7 @@ def _words(plane: Plane) -> str:
 # --- clusters -----------------------------------------------------------------------------------------------
 
 
-def _clusters(
+def density_clusters(
     voxels: Float[np.ndarray, "v 3"], counts: Integer[np.ndarray, "v"], config: SegmentationConfig
 ) -> Integer[np.ndarray, "v"]:
     """DBSCAN whose radius follows the spacing of the points (`counts` a voxel); -1 for noise."""
@@ -248,7 +224,7 @@ def _clusters(
     return cluster
 
 
-def _joined(
+def small_joined(
     voxels: Float[np.ndarray, "v 3"], cluster: Integer[np.ndarray, "v"], config: SegmentationConfig
 ) -> Integer[np.ndarray, "v"]:
     """Pieces given to the nearest other cluster, the smallest first: a leg to its table."""
@@ -267,7 +243,7 @@ def _joined(
     return cluster
 
 
-def _without_flat(
+def without_flat(
     voxels: Float[np.ndarray, "v 3"],
     cluster: Integer[np.ndarray, "v"],
     planes: tuple[Plane, ...],
@@ -285,7 +261,7 @@ def _without_flat(
     return cluster
 
 
-def _numbered(
+def numbered(
     voxels: Float[np.ndarray, "v 3"],
     cluster: Integer[np.ndarray, "v"],
     voxel_of: Integer[np.ndarray, "n"],

@@ -24,6 +24,8 @@ UNREADABLE = (
     KeyError,
 )
 
+CUT_WITHOUT = "--segment changes for two or more scans of one room, --segment geometric for one alone"
+
 
 @dataclass(frozen=True, kw_only=True)
 class ReadOptions:

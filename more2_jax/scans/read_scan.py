@@ -11,7 +11,7 @@ from jaxtyping import Float, Integer
 
 from more2_jax.scans.formats.registry import FORMATS, WITH_DEPTH_FRAMES
 from more2_jax.scans.geometric_segmentation import SegmentationConfig, segment_geometric
-from more2_jax.scans.labeled_cloud import LabeledCloud, ReadOptions, one_line
+from more2_jax.scans.labeled_cloud import CUT_WITHOUT, LabeledCloud, ReadOptions, one_line
 from more2_jax.scans.normal_sides import outward
 from more2_jax.scans.predicted_masks import lay_masks
 from more2_jax.types import Instance, Scan, Skipped
@@ -34,7 +34,7 @@ def read_scan(
     min_points: int = 64,
     masks: str | Path | None = None,
     min_score: float = 0.5,
-    segment: Literal["geometric"] | None = None,
+    segment: Literal["changes", "geometric"] | None = None,
     depth_frames: bool = False,
 ) -> Scan:
     """Reads one scan: instances in meters (float64, the scan's own frame), and what was left out.
@@ -53,19 +53,27 @@ def read_scan(
     coordinates that are not finite, or no instance is left.
     """
     path = Path(path)
-    if unit not in UNITS_M or segment not in (None, "geometric"):
-        raise ValueError(f"unit {unit!r}, segment {segment!r}; needed m, cm or mm; geometric or None")
+    check_unit(unit)
+    _check_alone(path, segment)
     masks = None if masks is None else Path(masks)
     needed = segment is None and masks is None
     options = ReadOptions(
         instance_property=instance_property, masks=masks, masks_needed=needed, depth_frames=depth_frames
     )
-    cloud = _read(path, options)
+    cloud = read_cloud(path, options)
     if masks is not None:
         cloud = lay_masks(cloud, path, masks, min_score)
     if segment is not None:
         cloud = _segmented(path, cloud, unit)
-    return _scan(path, cloud, unit, min_points)
+    return scan_of(path, cloud, unit, min_points)
+
+
+def _check_alone(path: Path, segment: str | None) -> None:
+    if segment not in (None, "geometric"):
+        raise ValueError(
+            f"{path}: segment {segment!r} of one scan; needed geometric or None (changes are between scans: more2 run"
+            " with two or more, or read_changed_scans)"
+        )
 
 
 def _segmented(path: Path, cloud: LabeledCloud, unit: str) -> LabeledCloud:
@@ -73,7 +81,7 @@ def _segmented(path: Path, cloud: LabeledCloud, unit: str) -> LabeledCloud:
     if cloud.instance is not None:
         said = "the scan has instance masks, so --segment geometric is not used"
         return replace(cloud, warnings=(*cloud.warnings, said))
-    _check_points(path, cloud.points)
+    check_points(path, cloud.points)
     try:
         found = segment_geometric(cloud.points * UNITS_M[cloud.unit or unit], SegmentationConfig())
     except ValueError as error:
@@ -88,8 +96,8 @@ def _segmented(path: Path, cloud: LabeledCloud, unit: str) -> LabeledCloud:
     )
 
 
-def _read(path: Path, options: ReadOptions) -> LabeledCloud:
-    """What the first format that recognizes the path reads."""
+def read_cloud(path: Path, options: ReadOptions) -> LabeledCloud:
+    """What the first format that recognizes the path reads, in the file's unit. Raises ValueError in one line."""
     if not path.exists():
         raise ValueError(f"{path}: no such file or folder")
     for form in FORMATS:
@@ -111,7 +119,14 @@ def _read(path: Path, options: ReadOptions) -> LabeledCloud:
     raise ValueError(f"{path}: {what}; needed a .ply, an .npz, or a folder of one .ply per object")
 
 
-def _check_points(path: Path, points: Float[np.ndarray, "n 3"]) -> None:
+def check_unit(unit: str) -> None:
+    """Raises ValueError for a unit that is none of `UNITS_M`."""
+    if unit not in UNITS_M:
+        raise ValueError(f"unit {unit!r}; needed m, cm or mm")
+
+
+def check_points(path: Path, points: Float[np.ndarray, "n 3"]) -> None:
+    """Raises ValueError, in one line, for no points, and for coordinates that are not finite or too large."""
     if not len(points):
         raise ValueError(f"{path}: no instances left; the scan has no points")
     if bad := int((~np.isfinite(points).all(axis=1)).sum()):
@@ -125,13 +140,14 @@ def _check_points(path: Path, points: Float[np.ndarray, "n 3"]) -> None:
 # --- from labeled points to instances ----------------------------------------------------------------------
 
 
-def _scan(path: Path, cloud: LabeledCloud, unit: str, min_points: int) -> Scan:
+def scan_of(path: Path, cloud: LabeledCloud, unit: str, min_points: int) -> Scan:
+    """The labeled points of a file as instances, in meters. Raises ValueError, in one line, where none is left."""
     unit = cloud.unit or unit
     if cloud.instance is None:
         raise ValueError(
-            f"{path}: no instance masks; pass predicted ones with --masks, or --segment geometric"
+            f"{path}: no instance masks; pass predicted ones with --masks, or cut it without: {CUT_WITHOUT}"
         )
-    _check_points(path, cloud.points)
+    check_points(path, cloud.points)
     points = cloud.points * UNITS_M[unit]
     sensors = sensors_of(path, cloud)
     background = points[cloud.instance <= 0]

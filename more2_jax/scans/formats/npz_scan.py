@@ -8,12 +8,12 @@ import numpy as np
 
 from more2_jax.scans.files.npz import read_arrays
 from more2_jax.scans.files.ply_faces import unit_or_zero
-from more2_jax.scans.labeled_cloud import LabeledCloud, ReadOptions, instance_ids
+from more2_jax.scans.labeled_cloud import CUT_WITHOUT, LabeledCloud, ReadOptions, instance_ids
 
 COLORS = ("color", "colors")  # the first that is there
 NORMALS = ("normal", "normals")  # the first that is there
 SENSORS, CAMERAS = "sensors", "T_scan_camera"  # places (s, 3), or poses (s, 4, 4) of cameras in the scan
-HOW = " (name the instances with --instance-property, or cut the scan with --segment geometric)"
+HOW = f" (name the instances with --instance-property, or cut the scan without: {CUT_WITHOUT})"
 
 
 def recognizes(path: Path) -> bool:

@@ -13,7 +13,7 @@ from jaxtyping import Integer
 
 from more2_jax.scans.files.ply_cloud import INSTANCE_PROPERTIES
 from more2_jax.scans.files.ply_faces import unit_or_zero
-from more2_jax.scans.labeled_cloud import LabeledCloud, ReadOptions
+from more2_jax.scans.labeled_cloud import CUT_WITHOUT, LabeledCloud, ReadOptions
 
 LONGEST_HEADER = 65_536  # bytes
 LONGEST_REFERENCE = 264  # bytes that three bytes of LZF, a reference back, can yield
@@ -106,7 +106,7 @@ def _instance_field(path: Path, columns: dict[str, np.ndarray], options: ReadOpt
     has = f"integer fields are {', '.join(integers)}" if integers else "it has no integer field"
     raise ValueError(
         f"{path}: no integer field {' or '.join(wanted)} names the instance; {has} (choose one with"
-        " --instance-property, or cut the scan into planes and clusters with --segment geometric)"
+        f" --instance-property, or cut the scan without: {CUT_WITHOUT})"
     )
 
 

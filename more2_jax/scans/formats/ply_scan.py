@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from more2_jax.scans.files.ply_cloud import INSTANCE_PROPERTIES, PlyCloud, read_ply
-from more2_jax.scans.labeled_cloud import LabeledCloud, ReadOptions
+from more2_jax.scans.labeled_cloud import CUT_WITHOUT, LabeledCloud, ReadOptions
 
 
 def recognizes(path: Path) -> bool:
@@ -39,5 +39,5 @@ def _instance_property(path: Path, cloud: PlyCloud, options: ReadOptions) -> str
     has = f"integer properties are {', '.join(integers)}" if integers else "it has no integer property"
     raise ValueError(
         f"{path}: no integer vertex property {' or '.join(wanted)} names the instance; {has}"
-        " (choose one with --instance-property, or cut the scan into clusters with --segment geometric)"
+        f" (choose one with --instance-property, or cut the scan without: {CUT_WITHOUT})"
     )
