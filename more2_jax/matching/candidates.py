@@ -30,7 +30,7 @@ from more2_jax.network.prior import Prior, check_embedding
 from more2_jax.registration.pair_batch import PairBatch, local_batch, paired_rows, take_pairs
 from more2_jax.registration.pose_costs import LIFTED
 from more2_jax.registration.search import AlignableObject, FoundPoses, alignable, search_poses
-from more2_jax.types import ObservedObject
+from more2_jax.types import LocalBatch, ObservedObject
 
 TOP = 0.99  # share of a cloud's points below its top
 
@@ -74,24 +74,20 @@ def align_candidates(
     """Aligns the likeliest pairs of `old` (scene's frame) and `new` (scan's frame).
 
     `T_scene_scan`: how the scan is taken to lie, for what did not move; by default in the scene's frame. `seen`: what
-    the scene so far and the new scan show, upright; by default the objects and the instances themselves. Raises
-    ValueError as `check_asked` does.
+    both scans show, upright; by default objects and instances alone. Raises ValueError as `check_asked` does.
     """
     check_asked(prior, (*old, *new), matcher, motion)
     known = compared(old, new)
     among = proposed(proposal_of(known, matcher), matcher.candidates)
     rows = np.argwhere(among)[:, ::-1]
-    sides = local_batch(new), local_batch(old)
-    ready = [
-        alignable(b.take(np.arange(len(s))), matcher.search) for b, s in zip(sides, (new, old), strict=True)
-    ]
+    sides, ready = prepared((new, old), matcher.search)
     pairs = paired_rows(*sides, rows, np.eye(4) if T_scene_scan is None else T_scene_scan)
     objects = taken(ready[0], rows[:, 0]), taken(ready[1], rows[:, 1])
     found = search_poses(*objects, pairs.stayed, matcher.search, motion)
     found, off, own = told_by_prior(prior, ready, rows, found, matcher.search, motion)
     T_old_new = pairs.to_world(found.poses)
     seen = (seen or seen_in(old, new)) if motion == "upright" else None
-    metric = metric_evidence((new, old), sides, tuple(ready), rows, T_old_new, seen)  # type: ignore[arg-type]
+    metric = metric_evidence((new, old), sides, ready, rows, T_old_new, seen)
     return AlignedPairs(
         among=among,
         pairs=pairs,
@@ -126,6 +122,17 @@ def told_by_prior(
     source, target = (taken(x, at) for x, at in sides)
     found, off = off_completed_surfaces(prior, source, target, found, search)
     return found, off, np.max([off_own_surface(prior, x)[at] for x, at in sides], axis=0)
+
+
+def prepared(
+    sides: tuple[Sequence[ObservedObject], Sequence[ObservedObject]], search: SurfaceSearch
+) -> tuple[tuple[LocalBatch, LocalBatch], tuple[AlignableObject, AlignableObject]]:
+    """Both sides as batches, and their objects ready to be aligned, without the batches' fillers."""
+    first, second = (local_batch(side) for side in sides)
+    ready = (
+        alignable(b.take(np.arange(len(s))), search) for b, s in zip((first, second), sides, strict=True)
+    )
+    return (first, second), tuple(ready)  # pyright: ignore[reportReturnType]
 
 
 def taken(objects: AlignableObject, rows: Int[np.ndarray, " p"]) -> AlignableObject:
