@@ -35,6 +35,7 @@ from train.shards.losses import (
 )
 from train.shards.packed_shapes import read_shapes
 from train.shards.sampling import sample_batch
+from train.shards.shards import open_shards
 from train.tools import pack
 
 
@@ -169,6 +170,15 @@ def test_packed_shapes_are_the_shards_to_within_a_step(shards, tmp_path):
     )
     with pytest.raises(ValueError, match="no test/views"):
         read_shapes(packed, "test")
+
+
+def test_packed_shapes_name_every_mesh_and_its_license(shards, tmp_path):
+    pack.main((shards, shards), tmp_path / "small.npz", shapes=10**6, val=10**6, views=1, points=4, queries=4)
+    head, *rows = (line.split("\t") for line in (tmp_path / "small.credits.tsv").read_text().splitlines())
+    assert head == ["name", "source", "license"]
+    kept = [open_shards(shards, split).meta for split in ("train", "val")]
+    assert [r[0] for r in rows] == sorted(m["name"] for meta in kept for m in meta)
+    assert all(text for row in rows for text in row)
 
 
 @pytest.mark.parametrize("damage", [b"", b"PK\x03\x04 and no more"])

@@ -72,7 +72,7 @@ def _chosen(
 
 def write_credits(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
     """A line a shape: name, source, license with its author."""
-    lines = sorted({tuple(" ".join(str(m[k]).split()) for k in CREDIT) for m in rows})
+    lines = sorted({tuple(" ".join(str(m.get(k, "unknown")).split()) for k in CREDIT) for m in rows})
     path.write_text("".join("\t".join(line) + "\n" for line in [CREDIT, *lines]))
 
 
