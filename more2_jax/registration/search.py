@@ -31,8 +31,8 @@ from more2_jax.types import AnyArray, Embedding, LocalBatch, Sight, pytree, quan
 # Calls of one shape, so that scenes share compiled programs, and small, so that few fillers are worked on.
 OBJECTS_A_CALL = 2  # prepared together
 PAIRS_A_CALL = 8  # searched together: what fits a small CPU's caches
-# Every start is aligned for a third of the steps, and the best third of them go on: as right as all of them
-# (docs/relocalization.md) for two thirds of the work.
+# In any orientation every start is aligned for a third of the steps, and the best third of them go on: as right as all
+# of them for two thirds of the work (docs/performance.md). Upright there are fewer, of which all have all steps.
 ROUNDS = 3
 SAME_DEG = 10.0  # of starts that have come this near to one another's rotation the best alone goes on
 
@@ -121,7 +121,7 @@ def search_pair(
         cost += free_space_cost(poses, (s.coarse, t.coarse), (s.sight, t.sight), search, motion)
         return FoundPoses(poses=poses, cost=cost)
 
-    found = in_rounds(starts, aligned, search)
+    found = in_rounds(starts, aligned, search, ROUNDS if motion == "free" else 1)
     best = lowest_apart(found.cost, found.poses.rotation(), min(search.keep, len(found.cost)))
     return rescale(jax.tree.map(lambda x: x[best], found), radius)
 
@@ -130,17 +130,18 @@ def in_rounds(
     starts: jaxlie.SE3,
     aligned: Callable[[jaxlie.SE3, Float[Array, " steps"]], FoundPoses],
     search: SurfaceSearch,
+    rounds: int,
 ) -> FoundPoses:
-    """The best third of the starts, aligned by all steps: which those are is told after a third of the steps.
+    """The best of the starts, one of so many as there are `rounds` of steps, told after the first: aligned by all.
 
     `aligned` takes poses and the reaches of some steps. As many poses have their turn each time, so that it is
-    compiled once: a third of the starts after the other, then the best third, round by round.
+    compiled once: one part of the starts after the other, then the best, round by round.
     """
-    count, steps = -(-len(starts.wxyz_xyz) // ROUNDS), -(-search.steps // ROUNDS)
-    reaches = jnp.geomspace(search.first_reach, search.last_reach, ROUNDS * steps).reshape(ROUNDS, steps)
-    fillers = ROUNDS * count - len(starts.wxyz_xyz)
+    count, steps = -(-len(starts.wxyz_xyz) // rounds), -(-search.steps // rounds)
+    reaches = jnp.geomspace(search.first_reach, search.last_reach, rounds * steps).reshape(rounds, steps)
+    fillers = rounds * count - len(starts.wxyz_xyz)
     every = jax.tree.map(lambda x: jnp.concatenate([x, x[:fillers]]), starts)
-    found = FoundPoses(poses=every, cost=jnp.ones(ROUNDS * count))
+    found = FoundPoses(poses=every, cost=jnp.ones(rounds * count))
 
     def turn(
         carry: tuple[FoundPoses, Int[Array, " c"]], step: tuple[Array, Array]
@@ -148,14 +149,14 @@ def in_rounds(
         (found, rows), (number, reach) = carry, step
         best = partial(lowest_apart, found.cost, found.poses.rotation(), count, SAME_DEG)
         rows = jax.lax.switch(
-            jnp.clip(number - ROUNDS + 1, 0, 2),
+            jnp.clip(number - rounds + 1, 0, 2),
             (lambda: number * count + jnp.arange(count), lambda: best().astype(rows.dtype), lambda: rows),
         )
         some = aligned(jax.tree.map(lambda x: x[rows], found.poses), reach)
         return (jax.tree.map(lambda x, y: x.at[rows].set(y), found, some), rows), None
 
-    turns = jnp.arange(2 * ROUNDS - 1)
-    steps_of = turns, reaches[jnp.maximum(turns - ROUNDS + 1, 0)]
+    turns = jnp.arange(2 * rounds - 1)
+    steps_of = turns, reaches[jnp.maximum(turns - rounds + 1, 0)]
     (found, rows), _ = jax.lax.scan(turn, (found, jnp.arange(count)), steps_of)
     return jax.tree.map(lambda x: x[rows], found)
 
