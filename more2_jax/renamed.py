@@ -135,7 +135,7 @@ NAMES = {
         "train.furniture.symmetry": "yaw_symmetry",
     },
     "evidence": {
-        "more2_jax.matching.calibration": "Calibration Compared FREE HIGHEST UNASKED "
+        "more2_jax.matching.calibration": "Calibration Compared FREE UNASKED "
         "UNKNOWN UPRIGHT calibrated features log_odds weighed",
     },
     "fitting": {

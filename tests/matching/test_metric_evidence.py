@@ -10,7 +10,7 @@ from scipy.spatial import KDTree
 from more2_jax.config import EvidenceMatcher, SurfaceSearch
 from more2_jax.geometry.poses import apply_pose
 from more2_jax.matching.calibration import UPRIGHT
-from more2_jax.matching.candidates import align_candidates, odds_of
+from more2_jax.matching.candidates import align_candidates, evidence_at, odds_of
 from more2_jax.matching.metric_evidence import APART_M, metric_evidence, seen_in
 from more2_jax.network.embedding_batch import embed
 from more2_jax.registration.pair_batch import local_batch
@@ -99,7 +99,8 @@ def test_moving_a_scan_as_a_whole_changes_nothing(tiny_prior, scans):
 
 def test_a_half_whose_other_half_is_in_the_background_is_not_contradicted(tiny_prior, scans):
     """A mask that is cut: what it lost is still in its scan. Where nothing stands there, the scan says so."""
-    old, _ = scans
+    dense = box([1, 0.5, 0.7], [0, 0, 0], count=4000)
+    old = [dataclasses.replace(scans[0][0], points=dense, embedding=embed(tiny_prior, [dense])[0])]
     whole = box([1, 0.5, 0.7], [0.5, 2, 0], count=4000, seed=2)
     left = whole[:, 0] < np.median(whole[:, 0])
     half = [ObservedObject(points=whole[left], embedding=embed(tiny_prior, [whole[left]])[0])]
@@ -122,7 +123,8 @@ def test_empty_space_lowers_the_odds_and_is_asked_upright_alone(tiny_prior, scan
     )
     more, less = (odds_of(x, SEARCH, "upright") for x in (without, with_room))
     among = with_room.among
-    shares = with_room.metric.contradicted[:, 0] - without.metric.contradicted[:, 0]
+    told, untold = (evidence_at(x, SEARCH, "upright").contradicted for x in (with_room, without))
+    shares = told - untold
     assert (shares >= 0).all() and shares.max() > 0.05
     np.testing.assert_allclose((less - more)[among], UPRIGHT.contradicted * shares, atol=1e-6)
     free = align_candidates(
