@@ -90,7 +90,7 @@ def repair_text(scan: ScanRecord, repair: Repair) -> str:
             return f"{scan.name}: one mask of the scan before held {both}"
         return f"{scan.name}: instance {repair.instances[0]} is {both} in one mask"
     if repair.dropped or repair.regained:
-        return f"{scan.name}: {_border_text(repair)} ({repair.share:.0%} of them for sure)"
+        return f"{scan.name}: {_border_text(repair)} ({repair.share:.0%} within half the tolerance)"
     sure = f"in parts ({repair.share:.0%} on it)"
     if repair.absorbed:
         return (
