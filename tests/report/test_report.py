@@ -357,7 +357,8 @@ def test_mended_masks_are_listed():
     assert "friday: instance 4 is object_000 and object_001 in one mask" in text
     assert "friday: one mask of the scan before held object_000 and object_008" in text
     assert (
-        "40 of 900 points of object_000 (instance 4) are floor or wall, and left out (95% of them for" in text
+        "40 of 900 points of object_000 (instance 4) are floor or wall, and left out (95% within half the tolerance"
+        in text
     )
     assert "7 of 90 points of object_002 (in an earlier scan) are object_003" in text
     assert "1200 points beside the 3000 of object_001 (instance 3) are part of it, and taken in (75%" in text
