@@ -49,7 +49,7 @@ def decided(odds, *, partner=None, now=0.0, narrow=False, scale=(1.0, 1.0, 1.0))
 
 @pytest.mark.parametrize(
     ("partner", "left", "now", "doubt"),
-    [(None, 1, 0.0, False), (None, 2, 0.0, True), (0, 1, 4.0, True), (0, 1, 5.0, False), (0, 0, 0.0, False)],
+    [(None, 1, 0.0, False), (None, 2, 0.0, True), (0, 1, 4.0, True), (0, 1, 8.0, False), (0, 0, 0.0, False)],
 )
 def test_only_a_mask_whose_halves_could_be_what_is_missing_is_cut(partner, left, now, doubt):
     wholes = Wholes(
