@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from more2_jax.config import EvidenceMatcher, SceneConfig
-from more2_jax.geometry.poses import Pose, apply_pose
+from more2_jax.geometry.poses import Points, Pose, apply_pose
 from more2_jax.matching.color import color_of
 from more2_jax.meshing.object_mesh import object_meshes
 from more2_jax.network.embedding_batch import embed
@@ -39,6 +39,7 @@ from more2_jax.tracking.relocalize import known_object, relocalize
 from more2_jax.tracking.room_points import Cleared, without_room
 from more2_jax.tracking.scan_frame import Rooms
 from more2_jax.tracking.split_masks import mend_splits
+from more2_jax.tracking.surroundings import surroundings, surroundings_of_objects
 from more2_jax.types import (
     Embedding,
     Frame,
@@ -209,12 +210,36 @@ def compared_objects(
     """The objects (scene's frame, each with the pose to its own) and a scan's instances, as stages take them."""
     of_objects = object_sights(scene.objects, scene.scans)
     of_instances = instance_sights(instances, scan, remembered(scan.background))
-    old = [known_object(o, view, config) for o, view in zip(scene.objects, of_objects, strict=True)]
+    near, beside = surroundings_where_masks_may_be_wrong(scene, instances, scan, config)
+    old = [
+        known_object(o, view, config, around)
+        for o, view, around in zip(scene.objects, of_objects, near, strict=True)
+    ]
     new = [
-        ObservedObject(points=i.points, embedding=e, color=color_of(i.colors), sight=view, normals=i.normals)
-        for i, e, view in zip(instances, embeddings, of_instances, strict=True)
+        ObservedObject(
+            points=i.points,
+            embedding=e,
+            color=color_of(i.colors),
+            sight=view,
+            normals=i.normals,
+            around=around,
+        )
+        for i, e, view, around in zip(instances, embeddings, of_instances, beside, strict=True)
     ]
     return old, new
+
+
+def surroundings_where_masks_may_be_wrong(
+    scene: LivingScene, instances: Sequence[Instance], scan: Scan, config: SceneConfig
+) -> tuple[Sequence[Points | None], Sequence[Points | None]]:
+    """What lies around the objects (each in its own frame) and around a scan's instances, unless masks are kept."""
+    if not config.repair_masks:
+        return [None] * len(scene.objects), [None] * len(instances)
+    background = remembered(scan.background)
+    return (
+        surroundings_of_objects(scene.objects, scene.scans),
+        surroundings([i.points for i in instances], background),
+    )
 
 
 def usable(scan: Scan, config: SceneConfig) -> tuple[list[Instance], tuple[Skipped, ...]]:

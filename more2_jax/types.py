@@ -141,6 +141,8 @@ class LocalBatch:
     cloud: PointCloud = quantity("record")
     code: Embedding = quantity("record")
     sight: Sight | None = quantity("record", default=None)
+    # What its scan shows around each object, neither its own nor floor or wall; about the same origin.
+    around: PointCloud | None = quantity("record", default=None)
     origin: Float[Array | np.ndarray, "*batch 3"] | None = quantity("origin", default=None)
 
     def take(self, rows: Sequence[int] | Integer[np.ndarray, " k"]) -> LocalBatch:
@@ -229,6 +231,8 @@ class ObservedObject:
     # What sensors saw around it, where their places are known.
     sight: Sight | None = quantity("record", default=None)
     normals: Float[np.ndarray, "_ 3"] | None = quantity("direction", default=None)  # as in `Instance`
+    # What its scans show around it that is in no mask, neither floor nor wall.
+    around: Float[np.ndarray, "_ 3"] | None = quantity("position", default=None)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -41,6 +41,8 @@ class Surface:
     # Whether a normal is known to point outward, else it has no side. None: none is.
     sided: Bool[AnyArray, "*b n"] | None = quantity("invariant", default=None)
     dense_sided: Bool[AnyArray, "*b m"] | None = quantity("invariant", default=None)
+    # Of `dense`, what is the cloud's own; the rest lies around it. None: all.
+    own: Bool[AnyArray, "*b m"] | None = quantity("invariant", default=None)
     grid: NearestGrid | None = quantity(
         "record", default=None
     )  # names the nearest of `dense`; without it every distance is measured
@@ -63,10 +65,25 @@ def whole_surface(
     return Surface(sampled=cloud, normals=normals, dense_normals=normals, sided=sided, dense_sided=sided)
 
 
-def thinned(s: Surface, count: int) -> Surface:
-    """With about `count` of all points for a sample, as densely as each part was seen."""
+def surrounded(s: Surface, points: Float[Array, "k 3"], mask: Bool[Array, " k"]) -> Surface:
+    """A whole cloud amid what its scan shows around it: its own points are compared with all of the other's."""
     cloud = s.sampled
-    index, real = thin(cloud.dense_mask, count)
+    dense, real = jnp.concatenate([cloud.points, points]), jnp.concatenate([cloud.mask, mask])
+    normals = normal_estimator(dense, real)(points)
+    none = jnp.zeros(len(points), bool)
+    return dataclasses.replace(
+        s,
+        sampled=dataclasses.replace(cloud, dense=dense, dense_mask=real),
+        dense_normals=jnp.concatenate([s.normals, normals]),
+        dense_sided=None if s.sided is None else jnp.concatenate([s.sided, none]),
+        own=jnp.concatenate([cloud.mask, none]),
+    )
+
+
+def thinned(s: Surface, count: int) -> Surface:
+    """With about `count` of its own points for a sample, as densely as each part was seen."""
+    cloud = s.sampled
+    index, real = thin(cloud.dense_mask if s.own is None else s.own, count)
     sampled = dataclasses.replace(cloud, points=cloud.dense[index], mask=real)
     sided = None if s.dense_sided is None else s.dense_sided[index]
     return dataclasses.replace(s, sampled=sampled, normals=s.dense_normals[index], sided=sided)
@@ -77,8 +94,11 @@ def coarsened(s: Surface, count: int, dense: int, cells: int) -> Surface:
     index, real = thin(s.sampled.dense_mask, dense)
     points, normals = s.sampled.dense[index], s.dense_normals[index]
     sided = None if s.dense_sided is None else s.dense_sided[index]
+    own = None if s.own is None else s.own[index] & real
     cloud = Sampled(points=points, mask=real, dense=points, dense_mask=real)
-    fewer = Surface(sampled=cloud, normals=normals, dense_normals=normals, sided=sided, dense_sided=sided)
+    fewer = Surface(
+        sampled=cloud, normals=normals, dense_normals=normals, sided=sided, dense_sided=sided, own=own
+    )
     return dataclasses.replace(thinned(fewer, count), grid=nearest_grid(points, real, cells))
 
 

@@ -19,6 +19,8 @@ from more2_jax.network.prior import Prior, encode
 from more2_jax.registration.search import AlignableObject
 from more2_jax.types import Embedding, LocalBatch, ObservedObject, PointCloud, Sight, pytree, quantity
 
+AROUND_POINTS = 1024  # of what lies around an object
+
 
 @pytree
 class PairBatch:
@@ -93,7 +95,26 @@ def local_batch(objects: Sequence[ObservedObject], size: int | None = None) -> L
     origin = np.asarray(cloud.origin)
     rows = [objects[k if k < len(objects) else 0].embedding for k in range(len(origin))]
     code = jax.tree.map(lambda *x: np.stack(x), *rows)
-    return batch_of(jax.tree.map(np.asarray, cloud), code, padded_sights([o.sight for o in objects], origin))
+    batch = batch_of(jax.tree.map(np.asarray, cloud), code, padded_sights([o.sight for o in objects], origin))
+    return dataclasses.replace(batch, around=padded_around([o.around for o in objects], origin))
+
+
+def padded_around(
+    around: Sequence[Float[np.ndarray, "_ 3"] | None], origin: Float[np.ndarray, "b 3"]
+) -> PointCloud | None:
+    """What lies around every object, about its origin; fillers have the first object's. None where nothing is known."""
+    if all(points is None for points in around):
+        return None
+    rows, masks = (
+        np.zeros((len(origin), AROUND_POINTS, 3), np.float32),
+        np.zeros((len(origin), AROUND_POINTS), bool),
+    )
+    for k, at in enumerate(origin):
+        points = around[k if k < len(around) else 0]
+        if points is not None and len(points):
+            some = points[np.linspace(0, len(points) - 1, min(len(points), AROUND_POINTS)).astype(int)]
+            rows[k, : len(some)], masks[k, : len(some)] = some - at, True
+    return PointCloud(points=rows, mask=masks)  # type: ignore[arg-type]
 
 
 def observe(prior: Prior, clouds: Sequence[Float[np.ndarray, "_ 3"]]) -> LocalBatch:

@@ -15,7 +15,7 @@ import jaxlie
 from jaxtyping import Array, Float, Int
 
 from more2_jax.config import MotionModel, SurfaceSearch
-from more2_jax.geometry.point_to_plane import Surface, align_by, coarsened, whole_surface
+from more2_jax.geometry.point_to_plane import Surface, align_by, coarsened, surrounded, whole_surface
 from more2_jax.geometry.points import cloud_radius
 from more2_jax.geometry.transform import rescale
 from more2_jax.network.row_map import chunked
@@ -41,7 +41,7 @@ SAME_DEG = 10.0  # of starts that have come this near to one another's rotation 
 class AlignableObject:
     """An object ready to be aligned, in its local frame, meters."""
 
-    whole: Surface = quantity("record")  # all of its points, with normals
+    whole: Surface = quantity("record")  # all of its points, with normals, and what lies around them
     coarse: Surface = quantity("record")  # what a search compares
     radius: Float[AnyArray, "*b"] = quantity("length")
     code: Embedding = quantity("record")
@@ -57,8 +57,8 @@ class FoundPoses:
 
 
 def alignable(batch: LocalBatch, search: SurfaceSearch) -> AlignableObject:
-    """Every object of a batch with its normals and its coarse surface."""
-    local = LocalBatch(cloud=batch.cloud, code=batch.code, sight=batch.sight)
+    """Every object of a batch with its normals, what lies around it, and its coarse surface."""
+    local = LocalBatch(cloud=batch.cloud, code=batch.code, sight=batch.sight, around=batch.around)
     return chunked(partial(_alignable, search=search), OBJECTS_A_CALL, local)
 
 
@@ -68,6 +68,9 @@ def _alignable(batch: LocalBatch, search: SurfaceSearch) -> AlignableObject:
         mask = row.cloud.mask
         points = jnp.where(mask[:, None], row.cloud.points, 0.0)  # NaN in masked rows goes no further
         whole = whole_surface(points, mask, row.cloud.normals)
+        if row.around is not None:
+            near = jnp.where(row.around.mask[:, None], row.around.points, 0.0)
+            whole = surrounded(whole, near, row.around.mask)
         coarse = coarsened(whole, search.points, search.dense, search.cells)
         radius = cloud_radius(points, mask)
         return AlignableObject(whole=whole, coarse=coarse, radius=radius, code=row.code, sight=row.sight)

@@ -9,7 +9,7 @@ import jax
 import numpy as np
 
 from more2_jax.config import EvidenceMatcher, SceneConfig
-from more2_jax.geometry.poses import Pose, local_poses
+from more2_jax.geometry.poses import Points, Pose, local_poses
 from more2_jax.geometry.transform import transform
 from more2_jax.network.prior import Prior
 from more2_jax.registration.pair_batch import PairBatch, local_batch, pair_up
@@ -20,7 +20,9 @@ from more2_jax.tracking.scan_frame import settled_frame
 from more2_jax.types import Frame, Instance, Observation, ObservedObject, Registration, SceneObject, Sight
 
 
-def known_object(o: SceneObject, sight: Sight | None, config: SceneConfig) -> tuple[ObservedObject, Pose]:
+def known_object(
+    o: SceneObject, sight: Sight | None, config: SceneConfig, around: Points | None = None
+) -> tuple[ObservedObject, Pose]:
     """An object as a new scan is compared with it, in the scene's frame, and the pose from there to its own frame.
 
     All seen so far where it last stood, or (`accumulate_target` False) the reference observation.
@@ -36,7 +38,9 @@ def known_object(o: SceneObject, sight: Sight | None, config: SceneConfig) -> tu
             )
         rows, T_scene_ref = o.point_scan == reference.scan, place_of(reference)
         points, normals = o.points[rows], None if o.normals is None else o.normals[rows]
-    own = ObservedObject(points=points, embedding=o.embedding, color=o.color, sight=sight, normals=normals)
+    own = ObservedObject(
+        points=points, embedding=o.embedding, color=o.color, sight=sight, normals=normals, around=around
+    )
     return transform(own, T_scene_ref), np.linalg.inv(T_scene_ref)
 
 

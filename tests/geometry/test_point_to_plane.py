@@ -16,6 +16,8 @@ from more2_jax.geometry.point_to_plane import (
     pose_covariance,
     sliding,
     solve_spd,
+    surrounded,
+    thinned,
     whole_surface,
 )
 from more2_jax.geometry.points import transformed
@@ -211,3 +213,46 @@ def test_poses_compete_that_are_turned_otherwise_and_nearly_as_good():
     costs, best = jnp.array([0.1, 0.1, 0.105, 0.4]), jnp.array(0)
     assert turned_apart(poses, best, TURNED_DEG).tolist() == [False, False, True, True]
     assert nearly_as_good(costs, best).tolist() == [True, True, True, False]
+
+
+def amid(points, rest, real=None):
+    """A cloud amid other points of its scan."""
+    mask = np.ones(len(rest), bool) if real is None else real
+    return surrounded(as_surface(points), jnp.asarray(rest, jnp.float32), jnp.asarray(mask))
+
+
+def test_a_whole_fits_a_half_whose_rest_lies_around_it():
+    """A mask that is cut: at the true pose nothing is amiss, and alignment does not slide the whole onto the half."""
+    points, _ = box_points(np.random.default_rng(8), (1.6, 0.5, 0.4), 768)
+    left = points[:, 0] < 0.1
+    alone, whole = as_surface(points[left]), thinned(as_surface(points), 128)
+    surroundings = amid(points[left], points[~left])
+    fit = jax.jit(lambda T, s: misfit(T, whole, thinned(s, 128), (0.2,)))
+    assert fit(jaxlie.SE3.identity(), surroundings) < 0.02 < 0.15 < fit(jaxlie.SE3.identity(), alone)
+    start = jaxlie.SE3.from_translation(jnp.array([-0.25, 0.0, 0.0]))
+    off = [
+        np.linalg.norm(aligned(start, whole, thinned(s, 128), (0.3, 0.03), 30, "upright").translation())
+        for s in (surroundings, alone)
+    ]
+    assert off[0] < 0.01 and off[1] > 0.1
+
+
+def test_only_own_points_are_compared_and_what_is_masked_is_not_there():
+    rng = np.random.default_rng(9)
+    (points, _), (rest, _) = box_points(rng), box_points(rng)
+    own = thinned(amid(points, rest + 0.1), 64).sampled
+    assert np.isin(np.asarray(own.points[own.mask]), points).all() and own.mask.all()
+    nothing = amid(points, np.full_like(rest, 7.0), np.zeros(len(rest), bool))
+    other = thinned(as_surface(rest), 64)
+    T = jaxlie.SE3.from_translation(jnp.array([0.05, 0.0, 0.1]))
+    for limit in (0.05, 0.3):
+        there, without = (misfit(T, other, thinned(s, 64), (limit,)) for s in (nothing, as_surface(points)))
+        np.testing.assert_allclose(there, without, atol=1e-6)
+
+
+def test_what_lies_around_has_no_side():
+    points, axis = box_points(np.random.default_rng(10))
+    outward = np.eye(3)[axis]
+    s = surrounded(as_surface(points, outward=outward), jnp.asarray(points[:50] + 0.3), jnp.ones(50, bool))
+    assert s.dense_sided[: len(points)].mean() > 0.9 and not s.dense_sided[len(points) :].any()
+    assert as_surface(points).sided is None and amid(points, points[:50]).dense_sided is None

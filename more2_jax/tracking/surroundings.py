@@ -1,0 +1,56 @@
+"""What scans show around an object, neither floor nor wall: what a mask that is cut leaves behind, and its neighbors.
+
+Beyond the paper, which takes masks as true. An object's own points are compared with the other's points and with what
+lies around those: half a table is explained by a whole one where the other half lies in the background, or in a mask
+of its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from more2_jax.geometry.poses import Points, apply_pose
+from more2_jax.geometry.room_planes import on_planes, room_planes, within
+from more2_jax.tracking.objects import accumulated, points_of
+from more2_jax.types import ScanRecord, SceneObject
+
+REACH = 0.5  # shares of an object's radius: what lies so near may be a part of it
+LEAST_REACH_M = 0.2
+OTHER_POINTS = 500  # of another object, about as dense as a scan's background is remembered
+
+NOTHING = np.zeros((0, 3))
+
+
+def surroundings_of_objects(objects: Sequence[SceneObject], scans: Sequence[ScanRecord]) -> list[Points]:
+    """Around every object where its accumulated observations saw it, in its own frame."""
+    found: list[list[Points]] = [[NOTHING] for _ in objects]
+    for scan in scans:
+        there = [
+            (k, seen) for k, o in enumerate(objects) for seen in accumulated(o) if seen.scan == scan.index
+        ]
+        near = surroundings([points_of(objects[k], seen) for k, seen in there], scan.background)
+        for (k, seen), points in zip(there, near, strict=True):
+            found[k].append(apply_pose(seen.T_ref_scan, points))
+    return [np.concatenate(parts) for parts in found]
+
+
+def surroundings(clouds: Sequence[Points], background: Points) -> list[Points]:
+    """What lies around each of a scan's clouds: the background that is neither floor nor wall, and the other clouds."""
+    if not clouds:
+        return []
+    few = [c[:: max(1, -(-len(c) // OTHER_POINTS))] for c in clouds]
+    owner = np.repeat(np.arange(len(few)), [len(c) for c in few])
+    others, room = np.concatenate(few), np.concatenate([background, *clouds])
+    return [around(c, background, others[owner != k], room) for k, c in enumerate(clouds)]
+
+
+def around(cloud: Points, background: Points, others: Points, room: Points) -> Points:
+    """Points near a cloud, of the background without floor and walls, and of others; `room` is all of the scan."""
+    radius = np.linalg.norm(cloud - cloud.mean(axis=0), axis=1).max()
+    tree, reach = KDTree(cloud), max(REACH * radius, LEAST_REACH_M)
+    near, beside = (within(tree, p, reach) for p in (background, others))
+    on, _ = on_planes(near, room_planes(cloud, background, room), np.concatenate([near, cloud]))
+    return np.concatenate([near[~on], beside])
