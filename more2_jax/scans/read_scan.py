@@ -14,7 +14,6 @@ from more2_jax.scans.geometric_segmentation import SegmentationConfig, segment_g
 from more2_jax.scans.labeled_cloud import CUT_WITHOUT, LabeledCloud, ReadOptions, one_line
 from more2_jax.scans.normal_sides import outward
 from more2_jax.scans.predicted_masks import lay_masks
-from more2_jax.scans.sensor_normals import seen_normals
 from more2_jax.types import Instance, Scan, Skipped
 
 UNITS_M = {"m": 1.0, "cm": 0.01, "mm": 0.001}
@@ -48,8 +47,7 @@ def read_scan(
     mm. Instances of fewer than `min_points` points are reported in `Scan.skipped`; sizes that look like another
     unit, in `Scan.warnings`. `masks` are predicted ones (`data.masks`): those scored `min_score` or more replace
     the scan's own. `segment="geometric"` cuts a cloud without instances into planes and clusters; `depth_frames`
-    reads the raw depth of 3RScan (paper §4). Normals are the file's, else those of its faces, else those that
-    its sensors, where they are known, have seen.
+    reads the raw depth of 3RScan (paper §4). Normals are the file's, else those of its faces.
 
     Raises ValueError, in one line, when the file is missing, unknown, damaged, has no instance property, has
     coordinates that are not finite, or no instance is left.
@@ -171,9 +169,9 @@ def scan_of(path: Path, cloud: LabeledCloud, unit: str, min_points: int) -> Scan
 def _outward_normals(
     cloud: LabeledCloud, instance: Integer[np.ndarray, " n"], sensors: Float[np.ndarray, "s 3"]
 ) -> tuple[Float[np.ndarray, "n 3"] | None, tuple[str, ...]]:
-    """The cloud's normals, out of the matter, and a warning where they had to be turned; without, by its sensors."""
+    """The cloud's normals, out of the matter, and a warning where they had to be turned."""
     if cloud.normals is None:
-        return (seen_normals(cloud.points, instance, sensors) if len(sensors) else None), ()
+        return None, ()
     normals, turned = outward(cloud.points, cloud.normals, instance, sensors)
     said = ("normals point into the surfaces, away from the room; they are turned around",) if turned else ()
     return normals, said
