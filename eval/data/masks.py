@@ -94,7 +94,7 @@ def split(scan: Scan, rng: np.random.Generator) -> Scan:
 
 
 def eroded(scan: Scan, rng: np.random.Generator) -> Scan:
-    """Every mask loses its outermost points."""
+    """Every mask loses its outermost points to the background."""
 
     def inner(points: Points) -> Points:
         distance = np.linalg.norm(points - points.mean(axis=0), axis=1)
@@ -104,7 +104,10 @@ def eroded(scan: Scan, rng: np.random.Generator) -> Scan:
 
 
 def wrong(scan: Scan, rng: np.random.Generator) -> Scan:
-    """Of every mask's points, `WRONG` are the nearest ones of other objects and of the background instead."""
+    """Of every mask's points, `WRONG` are the nearest ones of other objects and of the background instead.
+
+    What a mask shows of others stays theirs too.
+    """
     others = [i.points for i in scan.instances]
 
     def stained(points: Points) -> Points:
@@ -124,10 +127,14 @@ def _some(scan: Scan) -> int:
 
 
 def _each(scan: Scan, change: Callable[[Points], Points]) -> Scan:
-    instances = tuple(
-        dataclasses.replace(i, points=change(i.points), colors=None, normals=None) for i in scan.instances
-    )
-    return dataclasses.replace(scan, instances=instances)
+    """Every mask changed; the points it loses are still in the scan, as background."""
+    instances, background = [], [scan.background]
+    for i in scan.instances:
+        points = change(i.points)
+        kept = _rows(points)
+        background.append(i.points[[bytes(row) not in kept for row in np.asarray(i.points, np.float64)]])
+        instances.append(dataclasses.replace(i, points=points, colors=None, normals=None))
+    return dataclasses.replace(scan, instances=tuple(instances), background=np.concatenate(background))
 
 
 DAMAGES: dict[str, Damage] = {"merged": merged, "split": split, "eroded": eroded, "wrong": wrong}

@@ -252,6 +252,13 @@ def test_what_each_damage_does():
     lost = [o for o in by_kind["merged"].objects if LOST in o.instance.values()]
     assert len(lost) >= 2  # two objects of one mask: it shows one of them
     assert not any(LOST in o.instance.values() for k in ("eroded", "wrong") for o in by_kind[k].objects)
+    for kind in ("eroded", "wrong"):  # a mask loses points, the scan none
+        for whole, scan in zip(scene.scans, by_kind[kind].scans, strict=True):
+            has, had = (
+                {bytes(p) for c in (s.background, *(i.points for i in s.instances)) for p in c}
+                for s in (scan, whole)
+            )
+            assert has == had
     inner = by_kind["eroded"].scans[0].instances[0].points
     assert len(inner) == 150
     old, new = ({bytes(p) for p in s.scans[0].instances[0].points} for s in (scene, by_kind["wrong"]))
