@@ -1,0 +1,173 @@
+"""Tables of the documentation, made from what runs left behind: no figure is typed.
+
+`python -m eval.docs_figures keep runs/e2e_cut --name real_cut` stores the figures of a run in docs/figures;
+`python -m eval.docs_figures write` makes the tables of every page anew. A page says where one belongs:
+
+    <!-- figures: runs = real_cut, real_mix; show = recall, MR -->
+    <!-- end of figures -->
+
+One run: a line a figure, with intervals, a column a method. Several: a line a run, ours / the best peer.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+from train.run.program import run
+
+DOCS = Path("docs")
+BLOCK = re.compile(r"(<!-- figures: (?P<what>[^>]*?) -->\n).*?(<!-- end of figures -->)", re.DOTALL)
+# What a page calls a figure, and its name and column in results.json.
+FIGURES = {
+    "recall": ("instance recall", "strict"),
+    "MR": ("MR", "strict"),
+    "MR, paper's formula": ("MR", "paper"),
+    "MRR": ("MRR", "strict"),
+    "F1": ("added and removed, F1", ""),
+    "t-mAP": ("t-mAP", ""),
+    "t-AP50": ("t-AP50", ""),
+    "median RE": ("MedRE of true pairs", "strict"),
+    "RE < 5°": ("RE < 5°", "strict"),
+    "TE < 5 cm": ("TE < 5 cm", "strict"),
+    "time": ("time a scene", ""),
+}
+SENSE = {"higher": 1.0, "lower": -1.0}
+OURS = "ours"  # methods whose names begin so
+
+
+def main(
+    task: Literal["keep", "write"], runs: tuple[Path, ...] = (), *, name: str = "", docs: Path = DOCS
+) -> None:
+    """Stores the figures of a run, or makes the tables of all pages anew.
+
+    Args:
+        task: keep the figures of a run, or write the tables.
+        runs: keep: the folder of the run.
+        name: keep: what pages call it.
+        docs: folder of the pages; figures lie in its folder figures.
+    """
+    if task == "keep":
+        if len(runs) != 1 or not name:
+            raise ValueError(f"keep got {len(runs)} runs and name {name!r}; needed one run and its name")
+        kept = kept_of(json.loads((runs[0] / "results.json").read_text(encoding="utf-8")))
+        (docs / "figures").mkdir(exist_ok=True)
+        text = json.dumps(kept, ensure_ascii=False, indent=1)
+        (docs / "figures" / f"{name}.json").write_text(text + "\n", encoding="utf-8")
+        return
+    for page in sorted(docs.rglob("*.md")):
+        text = page.read_text(encoding="utf-8")
+        made = with_tables(text, docs / "figures")
+        if made != text:
+            page.write_text(made, encoding="utf-8")
+
+
+def kept_of(results: dict[str, Any]) -> dict[str, Any]:
+    """Of results.json, the figures over all scenes that pages may show, and what they belong to."""
+    wanted = set(FIGURES.values())
+    fields = ("name", "column", "method", "value", "unit", "better", "count", "failures", "ci95", "scenes")
+    rows = [
+        {k: r[k] for k in fields}
+        for r in results["rows"]
+        if r["group"] == "all" and (r["name"], r["column"]) in wanted
+    ]
+    facts = {k: results[k] for k in ("command", "date", "hardware", "versions")}
+    return {**facts, "masks": results["settings"].get("masks", "true"), "rows": rows}
+
+
+def with_tables(text: str, figures: Path) -> str:
+    """A page with the tables that its marks ask for. Raises ValueError where one asks for what is not kept."""
+
+    def made(match: re.Match[str]) -> str:
+        return match.group(1) + table_of(match.group("what"), figures) + match.group(3)
+
+    return BLOCK.sub(made, text)
+
+
+def table_of(what: str, figures: Path) -> str:
+    """The table of one mark, in Markdown."""
+    asked = dict(part.strip().split(" = ", 1) for part in what.split(";"))
+    names, shown = ([x.strip() for x in re.split(r",(?! paper)", asked[key])] for key in ("runs", "show"))
+    if unknown := [x for x in shown if x not in FIGURES]:
+        raise ValueError(f"figures {unknown}; needed some of {list(FIGURES)}")
+    runs = {}
+    for name in names:
+        path = figures / f"{name}.json"
+        if not path.is_file():
+            raise ValueError(
+                f"{path}: no such figures; needed `python -m eval.docs_figures keep RUN --name {name}`"
+            )
+        runs[name] = json.loads(path.read_text(encoding="utf-8"))
+    lines = of_one(runs[names[0]], shown) if len(runs) == 1 else of_several(runs, shown)
+    return "\n".join(lines) + "\n"
+
+
+def of_one(kept: dict[str, Any], shown: Sequence[str]) -> list[str]:
+    """A line a figure, with its interval; a column a method."""
+    methods = list(dict.fromkeys(r["method"] for r in kept["rows"]))
+    lines = [row_of(["", *methods]), row_of(["---"] * (len(methods) + 1))]
+    for figure in shown:
+        rows = rows_of(kept, figure)
+        best = max((SENSE[r["better"]] * r["value"] for r in rows.values()), default=0.0)
+        cells = [
+            cell(r, SENSE[r["better"]] * r["value"] >= best) if (r := rows.get(m)) else "" for m in methods
+        ]
+        unit = next(iter(rows.values()))["unit"] if rows else ""
+        lines.append(row_of([f"{figure} [{unit}]", *cells]))
+    date = kept["date"][:10]
+    return [*lines, "", f"`{kept['command']}`, {date}, {kept['rows'][0]['scenes']} rooms."]
+
+
+def of_several(runs: dict[str, dict[str, Any]], shown: Sequence[str]) -> list[str]:
+    """A line a run, a column a figure: ours / the best of the others."""
+    lines = [row_of(["run", *shown, "rooms, pairs", "date"]), row_of(["---"] * (len(shown) + 3))]
+    for name, kept in runs.items():
+        cells = [against_best(rows_of(kept, figure)) for figure in shown]
+        pairs = max((r["count"] for r in rows_of(kept, "recall").values()), default=0)
+        scenes = kept["rows"][0]["scenes"]
+        lines.append(row_of([f"`{name}`", *cells, f"{scenes}, {pairs}", kept["date"][:10]]))
+    return lines
+
+
+def rows_of(kept: dict[str, Any], figure: str) -> dict[str, dict[str, Any]]:
+    """By method."""
+    key = FIGURES[figure]
+    return {r["method"]: r for r in kept["rows"] if (r["name"], r["column"]) == key}
+
+
+def against_best(rows: dict[str, dict[str, Any]]) -> str:
+    """Ours / the best of the others, the better one bold, or both."""
+    ours, others = ([r for m, r in rows.items() if m.startswith(OURS) is mine] for mine in (True, False))
+    chosen = [max(side, key=lambda r: SENSE[r["better"]] * r["value"]) for side in (ours, others) if side]
+    best = max((SENSE[r["better"]] * r["value"] for r in chosen), default=0.0)
+    return " / ".join(bold(number(r["value"]), SENSE[r["better"]] * r["value"] >= best) for r in chosen)
+
+
+def cell(row: dict[str, Any], best: bool) -> str:
+    """A figure, its interval, and in how many cases there is none."""
+    text = bold(number(row["value"]), best)
+    if row["ci95"]:
+        text += f" ({number(row['ci95'][0])} to {number(row['ci95'][1])})"
+    return text + (f"; {row['failures']} failed" if row["failures"] else "")
+
+
+def number(value: float) -> str:
+    """Three digits."""
+    return f"{value:.1f}" if abs(value) >= 10 else f"{value:.2f}"
+
+
+def bold(text: str, wanted: bool) -> str:
+    """Bold in Markdown."""
+    return f"**{text}**" if wanted else text
+
+
+def row_of(cells: Sequence[str]) -> str:
+    """A row of a table."""
+    return f"| {' | '.join(cells)} |"
+
+
+if __name__ == "__main__":
+    run(main)

@@ -1,0 +1,100 @@
+"""No table of the documentation differs from the figures that runs left behind."""
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+
+from eval.docs_figures import BLOCK, FIGURES, kept_of, main, with_tables
+
+DOCS = Path(__file__).parents[2] / "docs"
+
+
+def row(name, column, method, value, better="higher", group="all"):
+    more = dict(unit="%", count=8, failures=0, ci95=[value - 1, value + 1], scenes=2, group=group)
+    return dict(name=name, column=column, method=method, value=value, better=better, **more)
+
+
+RESULTS = {
+    "command": "python -m eval.end_to_end --data rooms",
+    "date": "2026-11-25T03:48:12+00:00",
+    "hardware": "2 cores",
+    "versions": {},
+    "settings": {},
+    "rows": [
+        row("MR", "strict", "ours, robust", 80.0),
+        row("MR", "strict", "GICP", 70.0),
+        row("MR", "strict", "RANSAC", 75.0),
+        row("MR", "strict", "ours, robust", 5.0, group="category chair"),
+        row("MedRE of true pairs", "strict", "ours, robust", 2.0, "lower"),
+        row("MedRE of true pairs", "strict", "GICP", 1.0, "lower"),
+        row("something else", "", "GICP", 1.0),
+    ],
+}
+ONE = "<!-- figures: runs = a; show = MR, median RE -->\nold\n<!-- end of figures -->\n"
+TWO = ONE.replace("runs = a", "runs = a, b")
+
+
+@pytest.fixture
+def docs(tmp_path):
+    for name in "ab":
+        folder = tmp_path / "runs" / name
+        folder.mkdir(parents=True)
+        (folder / "results.json").write_text(json.dumps(RESULTS), encoding="utf-8")
+        main("keep", (folder,), name=name, docs=tmp_path)
+    return tmp_path
+
+
+def test_every_page_shows_what_is_kept():
+    pages = [p for p in DOCS.rglob("*.md") if "<!-- figures:" in p.read_text(encoding="utf-8")]
+    assert pages
+    for page in pages:
+        text = page.read_text(encoding="utf-8")
+        assert len(BLOCK.findall(text)) == text.count("<!-- figures:")
+        assert with_tables(text, DOCS / "figures") == text, (
+            f"{page.name}: `python -m eval.docs_figures write`"
+        )
+
+
+def test_what_is_kept_is_shown_somewhere():
+    text = "".join(p.read_text(encoding="utf-8") for p in DOCS.rglob("*.md"))
+    shown = {n.strip() for m in re.findall(r"<!-- figures: runs = ([^;]*);", text) for n in m.split(",")}
+    assert {p.stem for p in (DOCS / "figures").glob("*.json")} == shown
+
+
+def test_one_run_shows_all_methods_and_the_best_in_bold(docs):
+    made = with_tables(ONE, docs / "figures")
+    assert "| MR [%] | **80.0** (79.0 to 81.0) | 70.0 (69.0 to 71.0) | 75.0 (74.0 to 76.0) |" in made
+    assert "| median RE [%] | 2.00 (1.00 to 3.00) | **1.00** (0.00 to 2.00) |  |" in made
+    assert "old" not in made and RESULTS["command"] in made
+
+
+def test_several_runs_show_ours_beside_the_best_peer(docs):
+    made = with_tables(TWO, docs / "figures")
+    assert made.count("| **80.0** / 75.0 | 2.00 / **1.00** | 2, 0 | 2026-11-25 |") == 2
+    assert with_tables(made, docs / "figures") == made
+
+
+def test_a_page_is_written_and_the_rest_of_it_stays(docs):
+    (docs / "page.md").write_text(f"before\n{ONE}after {ONE}", encoding="utf-8")
+    main("write", docs=docs)
+    text = (docs / "page.md").read_text(encoding="utf-8")
+    assert text.startswith("before\n<!--") and text.count("80.0") == 2 and "old" not in text
+
+
+@pytest.mark.parametrize(
+    ("mark", "said"),
+    [(ONE.replace("= a", "= c"), "no such figures"), (ONE.replace("MR,", "XY,"), "needed some of")],
+)
+def test_what_is_not_there_is_refused(docs, mark, said):
+    with pytest.raises(ValueError, match=said):
+        with_tables(mark, docs / "figures")
+    with pytest.raises(ValueError, match="needed one run and its name"):
+        main("keep", docs=docs)
+
+
+def test_only_figures_over_all_scenes_are_kept():
+    kept = kept_of(RESULTS)["rows"]
+    assert {(r["name"], r["column"]) for r in kept} <= set(FIGURES.values())
+    assert [r["value"] for r in kept] == [80.0, 70.0, 75.0, 2.0, 1.0]
