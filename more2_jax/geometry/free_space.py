@@ -107,12 +107,14 @@ def stacked(views: Sequence[Sight]) -> Sight | None:
     return Sight(**{f.name: np.stack([getattr(v, f.name) for v in views]) for f in dataclasses.fields(Sight)})
 
 
-def padded_sights(sights: Sequence[Sight | None], origins: Float[np.ndarray, "b 3"]) -> Sight | None:
+def padded_sights(
+    sights: Sequence[Sight | None], origins: Float[np.ndarray, "b 3"], blank: bool = False
+) -> Sight | None:
     """One of `VIEWS` views for every row of a batch, about its origin, float32; views without free space fill up.
 
-    None where no row has any.
+    None where no row has any, unless `blank`.
     """
-    if all(s is None for s in sights):
+    if not blank and all(s is None for s in sights):
         return None
     blank = Sight(
         eye=np.zeros((VIEWS, 3)),

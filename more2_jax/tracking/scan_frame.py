@@ -47,9 +47,10 @@ def common_frame(
         aligned = align_candidates(prior, old, new, matcher, motion)
         weighed = Weighed(height_m=0.0, aligned=aligned, odds=odds_of(aligned, matcher.search, motion))
     lifted = vertical_shift(weighed.height_m)
-    pairs = np.argwhere(weighed.odds > 0)
+    likely = weighed.odds.value > 0
+    pairs = weighed.odds.pairs[likely]
     votes = Votes(
-        T_scene_scan=weighed.aligned.T_old_new[[weighed.aligned.row_of(k, i) for k, i in pairs.tolist()]],
+        T_scene_scan=weighed.aligned.T_old_new[likely],
         center=np.stack([o.points.mean(axis=0) for o in new])[pairs[:, 1]],
         object=pairs[:, 0],
         instance=pairs[:, 1],
