@@ -20,7 +20,8 @@ LEAST_GAIN = 0.05  # share of its log odds that motion leaves a pair
 AS_GOOD = 1.0  # of log odds: an exchange that loses less is as good
 NEVER = -np.inf  # log odds of a pair that is no candidate
 
-Pairs = Int[np.ndarray, "p 2"]  # (object, instance)
+Pairs = Int[np.ndarray, "p 2"]  # (object, instance): those listed,
+Chosen = Int[np.ndarray, "q 2"]  # and some of them
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,17 +44,17 @@ class LogOdds:
         found[tuple(self.pairs.T)] = self.value
         return found
 
-    def rows_of(self, pairs: Pairs) -> Int[np.ndarray, " q"]:
+    def rows_of(self, pairs: Chosen) -> Int[np.ndarray, " q"]:
         """Where pairs are listed."""
         return listed_at(self.pairs, pairs, self.shape[1])
 
 
-def listed_at(listed: Pairs, pairs: Pairs, instances: int) -> Int[np.ndarray, " q"]:
+def listed_at(listed: Pairs, pairs: Chosen, instances: int) -> Int[np.ndarray, " q"]:
     """Where pairs stand in a list that is sorted by objects, then by instances."""
     return np.searchsorted(*(p[:, 0] * instances + p[:, 1] for p in (listed, pairs)))
 
 
-def assign(odds: LogOdds, moved_m: Float[np.ndarray, " p"], weight: float) -> Pairs:
+def assign(odds: LogOdds, moved_m: Float[np.ndarray, " p"], weight: float) -> Chosen:
     """The pairs of the likeliest assignment: none that is likelier two objects than one.
 
     A meter moved (`moved_m`, of every listed pair) takes `weight` off the log odds of pairs that are possible: it
@@ -90,7 +91,7 @@ def largest_total(
     return chosen
 
 
-def interchangeable(odds: LogOdds, pairs: Pairs) -> list[bool]:
+def interchangeable(odds: LogOdds, pairs: Chosen) -> list[bool]:
     """Of every pair, whether another assignment of it explains the scans as well: identical copies, as a rule."""
     instance_of, object_of = (dict(p) for p in (pairs.tolist(), pairs[:, ::-1].tolist()))
     of_object, of_instance = (
@@ -117,7 +118,7 @@ def interchangeable(odds: LogOdds, pairs: Pairs) -> list[bool]:
 
 
 def unmatched(
-    odds: LogOdds, chance: Float[np.ndarray, " p"], pairs: Pairs
+    odds: LogOdds, chance: Float[np.ndarray, " p"], pairs: Chosen
 ) -> tuple[dict[int, float], dict[int, float]]:
     """Objects and instances left over, each with the probability that none of the others left over is it.
 

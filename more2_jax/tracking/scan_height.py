@@ -151,7 +151,7 @@ def height_votes(
 
 
 def few(votes: Float[np.ndarray, " v"]) -> Float[np.ndarray, " k"]:
-    """Some of the heights that have votes, `HEIGHTS` at most: those of a building are its floors' and its furniture's."""
+    """Some of the heights that have votes, `HEIGHTS` at most: a building has more pairs than heights."""
     return votes[:: max(1, -(-len(votes) // HEIGHTS))]
 
 

@@ -31,7 +31,7 @@ def searched(monkeypatch):
         original = module.search_poses
 
         def search_poses(source, target, stayed, *settings):
-            asked.append((name, len(source.radius)))
+            asked.append((name, len(stayed.wxyz_xyz)))
             return original(source, target, stayed, *settings)
 
         monkeypatch.setattr(module, "search_poses", search_poses)
@@ -68,11 +68,9 @@ def test_every_candidate_pair_is_searched_once_and_registration_searches_nothing
     codes = embed(tiny_prior, [i.points for i in second.instances])
     old, new = compared_objects(first, second.instances, codes, second, config)
     known = [o for o, _ in old]
-    among = candidates.proposed(
-        candidates.proposal_of(candidates.compared(known, new), config.matching), config.matching.candidates
-    )
+    worth = candidates.proposed(known, new, config.matching)
     made = add_scan(tiny_prior, first, second, config)
-    assert searched == [("matching", int(among.sum()))]
+    assert searched == [("matching", len(worth.pairs))]
     found = sum(len(o.observations) == 2 for o in made.objects)
     assert found > 0 and refined == [(found, config.matching.search.keep)]
 
