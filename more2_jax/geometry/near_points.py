@@ -20,9 +20,11 @@ class NearPoints:
         cell = self._cell(points)
         order = np.lexsort(cell.T)
         self._points, cell = points[order], cell[order]
-        first = np.flatnonzero(np.r_[True, (cell[1:] != cell[:-1]).any(axis=1)]) if len(points) else []
-        ends = [*first[1:], len(points)]
-        self._rows = {tuple(cell[a].tolist()): slice(a, b) for a, b in zip(first, ends, strict=True)}
+        cells, first, count = np.unique(cell, axis=0, return_index=True, return_counts=True)
+        self._rows = {
+            tuple(c): slice(a, a + n)
+            for c, a, n in zip(cells.tolist(), first.tolist(), count.tolist(), strict=True)
+        }
 
     def around(self, place: Float[np.ndarray, "3"]) -> Points:
         """All points within the reach of a place, and some a little farther off, in no order."""

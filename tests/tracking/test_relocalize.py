@@ -87,6 +87,19 @@ def test_a_scan_whose_frame_settles_elsewhere_is_refined_again_but_not_searched(
     assert refined == [(3, CONFIG.matching.search.keep)] * 2
 
 
+def test_pairs_registered_one_by_one_have_the_poses_they_have_together(tiny_prior, first, refined):
+    second = scan("b", THEN)
+    whole = add_scan(tiny_prior, first, second, CONFIG)
+    assert refined == [(3, CONFIG.matching.search.keep)]
+    refined.clear()
+    few = dataclasses.replace(CONFIG, memory_mb=relocalize.PAIR_MB)
+    apart = add_scan(tiny_prior, first, second, few)
+    assert refined == [(1, CONFIG.matching.search.keep)] * 3
+    for o, p in zip(whole.objects, apart.objects, strict=True):
+        np.testing.assert_array_equal(o.observations[-1].T_ref_scan, p.observations[-1].T_ref_scan)
+        assert o.observations[-1].sigma_m == p.observations[-1].sigma_m
+
+
 def test_another_frame_changes_what_staying_means_and_nothing_else(tiny_prior, first):
     second = scan("b", THEN)
     codes = embed(tiny_prior, [i.points for i in second.instances])
