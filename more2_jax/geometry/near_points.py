@@ -5,11 +5,15 @@ from __future__ import annotations
 import itertools
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from more2_jax.geometry.poses import Points
 
 CELLS = 3  # of a reach
+SIDES = np.array(
+    [1 << 42, 1 << 21, 1]
+)  # makes one number of a cell; a million cells either way along each axis
+WAYS = np.array(list(itertools.product(range(-CELLS, CELLS + 1), repeat=3)))
 
 
 class NearPoints:
@@ -17,22 +21,18 @@ class NearPoints:
 
     def __init__(self, points: Points, reach_m: float) -> None:
         self.reach_m = reach_m
-        cell = self._cell(points)
-        order = np.lexsort(cell.T)
-        self._points, cell = points[order], cell[order]
-        cells, first, count = np.unique(cell, axis=0, return_index=True, return_counts=True)
-        self._rows = {
-            tuple(c): slice(a, a + n)
-            for c, a, n in zip(cells.tolist(), first.tolist(), count.tolist(), strict=True)
-        }
+        key = self._cell(points) @ SIDES
+        order = np.argsort(key, kind="stable")
+        self._points = points[order]
+        cells, first, count = np.unique(key[order], return_index=True, return_counts=True)
+        ends = zip(cells.tolist(), first.tolist(), (first + count).tolist(), strict=True)
+        self._rows = {cell: slice(a, b) for cell, a, b in ends}
 
     def around(self, place: Float[np.ndarray, "3"]) -> Points:
         """All points within the reach of a place, and some a little farther off, in no order."""
-        ways = itertools.product(range(-CELLS, CELLS + 1), repeat=3)
-        middle = self._cell(place)
-        held = [self._rows.get(tuple((middle + way).tolist())) for way in ways]
+        held = [self._rows.get(cell) for cell in ((self._cell(place) + WAYS) @ SIDES).tolist()]
         parts = [self._points[rows] for rows in held if rows is not None]
         return np.concatenate(parts) if parts else self._points[:0]
 
-    def _cell(self, points: Float[np.ndarray, "*n 3"]) -> np.ndarray:
+    def _cell(self, points: Float[np.ndarray, "*n 3"]) -> Int[np.ndarray, "*n 3"]:
         return np.floor(points * (CELLS / self.reach_m)).astype(np.int64)
