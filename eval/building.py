@@ -22,6 +22,7 @@ import tyro
 
 from eval.data.flyingshape import flyingshape
 from eval.harness.plots import pyplot, save
+from eval.performance.stopwatch import Seconds
 from more2_jax.config import preset
 from more2_jax.network.prior import load_prior
 from more2_jax.progress import Progress
@@ -65,13 +66,14 @@ class Settings:
 
 @dataclass(frozen=True, kw_only=True)
 class Measured:
-    """What one size took. Seconds and peaks (resident set, MB) by stage, in the order of the work."""
+    """What one size took, by stage in the order of the work: wall clock, processor time of all threads, and peaks
+    of the resident set (MB)."""
 
     objects: int
     instances: int  # of the second scan
     points: int  # of both scans' objects
     seconds: dict[str, float]
-    cpu_seconds: float
+    cpu_seconds: dict[str, float]
     peak_mb: dict[str, float]
     found: int  # pairs that were matched,
     right: int  # those of them that are one object, or copies of it in other rooms,
@@ -96,9 +98,9 @@ def main(options: Annotated[Settings, tyro.conf.arg(name="")]) -> None:
 def in_own_process(count: int) -> dict[str, Any]:
     """`measured`, by this program called anew. Raises ValueError where that fails."""
     command = [sys.executable, "-m", "eval.building", *sys.argv[1:], "--one", str(count)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=False)
     if done.returncode:
-        raise ValueError(f"{count} objects: exit {done.returncode}; {done.stderr.strip()[-300:]}")
+        raise ValueError(f"{count} objects: exit {done.returncode}; needed 0")
     return json.loads(done.stdout.strip().splitlines()[-1])
 
 
@@ -108,7 +110,7 @@ def measured(options: Settings, count: int) -> Measured:
     config = replace(preset(options.preset, upright=upright), memory_mb=options.memory_mb)
     folders = sorted(p.parent for p in options.data.glob("scene_*/scene.json"))
     scans, truth = building([read_scene(folder) for folder in folders], count, options.points)
-    watch, began = Watch(), time.process_time()
+    watch = Watch()
     scene = start_scene(prior, scans[0], config, progress=watch)
     watch.mark("rest")
     scene = add_scan(prior, scene, scans[1], config, progress=watch)
@@ -121,7 +123,7 @@ def measured(options: Settings, count: int) -> Measured:
         instances=len(scans[1].instances),
         points=sum(len(i.points) for s in scans for i in s.instances),
         seconds=watch.seconds,
-        cpu_seconds=time.process_time() - began,
+        cpu_seconds=watch.cpu_seconds,
         peak_mb=watch.peak_mb,
         **matches(scene, truth),
     )
@@ -147,7 +149,9 @@ class Watch:
     """A watcher of stages that notes the seconds and the peak memory of each; what lies between is `rest`."""
 
     def __init__(self) -> None:
+        self._since = Seconds(time.perf_counter(), time.process_time())
         self.seconds: dict[str, float] = {}
+        self.cpu_seconds: dict[str, float] = {}
         self.peak_mb: dict[str, float] = {}
         self.mark("before")
 
@@ -157,10 +161,13 @@ class Watch:
 
     def mark(self, stage: str) -> None:
         """What was done since the last mark was `stage`."""
-        now, peak = time.perf_counter(), peak_mb()
+        now, peak = Seconds(time.perf_counter(), time.process_time()), peak_mb()
+        wall, cpu = now.wall - self._since.wall, now.cpu - self._since.cpu
+        print(f"{stage}: {wall:.1f} s, processor {cpu:.1f} s, {peak:.0f} MB", file=sys.stderr, flush=True)
         self.peak_mb[stage] = max(self.peak_mb.get(stage, 0.0), peak)
         if stage != "before":
-            self.seconds[stage] = self.seconds.get(stage, 0.0) + now - self._since
+            self.seconds[stage] = self.seconds.get(stage, 0.0) + wall
+            self.cpu_seconds[stage] = self.cpu_seconds.get(stage, 0.0) + cpu
         self._since = now
         Path(FORGET_PEAK[0]).write_text(FORGET_PEAK[1])
 
@@ -252,13 +259,17 @@ def joined(name: str, parts: Sequence[Scan]) -> Scan:
 
 
 def draw(path: Path, rows: Sequence[dict[str, Any]]) -> list[Path]:
-    """Seconds and peak memory over the number of objects, by stage, both axes logarithmic."""
+    """Processor time and peak memory over the number of objects, by stage, both axes logarithmic."""
     figure, panels = pyplot().subplots(1, 2, figsize=(8.5, 3.6))
     count = np.array([r["objects"] for r in rows], float)
-    for axes, key, label in zip(panels, ("seconds", "peak_mb"), ("seconds", "peak memory (MB)"), strict=True):
+    for axes, key, label in zip(
+        panels, ("cpu_seconds", "peak_mb"), ("processor seconds", "peak memory (MB)"), strict=True
+    ):
         for stage in (s for s in rows[-1][key] if s != "before"):
             axes.plot(count, [r[key].get(stage, np.nan) for r in rows], marker="o", label=stage)
-        total = np.array([sum(r[key].values()) if key == "seconds" else max(r[key].values()) for r in rows])
+        total = np.array(
+            [sum(r[key].values()) if key == "cpu_seconds" else max(r[key].values()) for r in rows]
+        )
         axes.plot(count, total, color="black", marker="o", label="all")
         growth = count * np.log(count)
         axes.plot(count, total[0] * growth / growth[0], color="gray", linestyle=":", label="n log n")
