@@ -1,4 +1,4 @@
-"""Points of a large scan by cells: what lies near a place, or in view of a sensor, is had without a look at the rest."""
+"""Points of a large scan by cells: what lies near a place, or in view, is had without a look at the rest."""
 
 from __future__ import annotations
 

@@ -15,7 +15,7 @@ def missed(wanted, found):
 
 
 @pytest.mark.parametrize("reach_m", [0.5, 4.0, 1000.0])
-@pytest.mark.parametrize("place", [(0.0, 0, 0), (-19.9, 3, 20), (70, 0, 0)])
+@pytest.mark.parametrize("place", [(0.0, 0, 0), (-19.9, 3, 20), (70.0, 0, 0)])
 def test_what_is_within_reach_comes_once_and_what_is_not_stays(reach_m, place):
     near = NearPoints(POINTS)
     found = near.points_of(near.cells_around(np.array(place), reach_m))
