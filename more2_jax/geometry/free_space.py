@@ -120,13 +120,13 @@ def stacked(views: Sequence[Sight]) -> Sight | None:
 
 
 def padded_sights(
-    sights: Sequence[Sight | None], origins: Float[np.ndarray, "b 3"], blank: bool = False
+    sights: Sequence[Sight | None], origins: Float[np.ndarray, "b 3"], always: bool = False
 ) -> Sight | None:
     """One of `VIEWS` views for every row of a batch, about its origin, float32; views without free space fill up.
 
-    None where no row has any, unless `blank`.
+    None where no row has any, unless `always`.
     """
-    if not blank and all(s is None for s in sights):
+    if not always and all(s is None for s in sights):
         return None
     blank = Sight(
         eye=np.zeros((VIEWS, 3)),

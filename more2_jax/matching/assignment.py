@@ -51,7 +51,8 @@ class LogOdds:
 
 def listed_at(listed: Pairs, pairs: Chosen, instances: int) -> Int[np.ndarray, " q"]:
     """Where pairs stand in a list that is sorted by objects, then by instances."""
-    return np.searchsorted(*(p[:, 0] * instances + p[:, 1] for p in (listed, pairs)))
+    known, asked = (p[:, 0] * instances + p[:, 1] for p in (listed, pairs))
+    return np.searchsorted(known, asked)
 
 
 def assign(odds: LogOdds, moved_m: Float[np.ndarray, " p"], weight: float) -> Chosen:

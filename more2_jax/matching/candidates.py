@@ -58,11 +58,8 @@ class AlignedPairs:
     """
 
     rows: Int[np.ndarray, "p 2"]  # (object, instance), by objects, then by instances
-    sides: tuple[Sequence[ObservedObject], Sequence[ObservedObject]]  # instances (m) and objects (n),
-    ready: tuple[
-        AlignableObject, AlignableObject
-    ]  # prepared, without what sensors saw unless a search asks for it,
-    origins: tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "n 3"]]  # and where their local frames lie
+    sides: tuple[Sequence[ObservedObject], Sequence[ObservedObject]]  # instances (m) and objects (n)
+    ready: tuple[AlignableObject, AlignableObject]  # prepared; what sensors saw only where a search asks
     stayed: jaxlie.SE3  # (p,): "it did not move", an instance's local frame to the object's
     found: FoundPoses  # (p, k), local frames: instances onto objects
     T_old_new: Float[np.ndarray, "p k 4 4"]  # those poses between the clouds' frames, float64
@@ -125,19 +122,18 @@ def align_candidates(
     T = np.eye(4) if T_scene_scan is None else T_scene_scan
     worth = proposed(old, new, matcher, T if place is None else place)
     rows = worth.pairs[:, ::-1]
-    ready, origins = zip(*(prepared(side, matcher.search) for side in (new, old)), strict=True)
-    ends = origins[1][rows[:, 1]], origins[0][rows[:, 0]]
+    (instances, of_new), (objects, of_old) = (prepared(side, matcher.search) for side in (new, old))
+    ends = of_old[rows[:, 1]], of_new[rows[:, 0]]
     stayed = local_poses(np.broadcast_to(T, (len(rows), 4, 4)), *ends)
-    found = search_poses(*ready, stayed, matcher.search, motion, rows)
-    found, off, own = told_by_prior(prior, ready, rows, found, matcher.search, motion)
-    T_old_new = world_poses(found.poses, *(o[:, None] for o in ends))
+    found = search_poses(instances, objects, stayed, matcher.search, motion, rows)
+    found, off, own = told_by_prior(prior, (instances, objects), rows, found, matcher.search, motion)
+    T_old_new = world_poses(found.poses, ends[0][:, None], ends[1][:, None])
     seen = (seen or seen_in(old, new)) if motion == "upright" else None
-    samples = samples_of(ready[0], origins[0]), samples_of(ready[1], origins[1])
+    samples = samples_of(instances, of_new), samples_of(objects, of_old)
     return AlignedPairs(
         rows=worth.pairs,
         sides=(new, old),
-        ready=ready,
-        origins=origins,
+        ready=(instances, objects),
         stayed=stayed,
         found=found,
         T_old_new=T_old_new,

@@ -73,7 +73,7 @@ def metric_evidence(
         others = pairs[:, 1 - way]
         order = np.argsort(others, kind="stable")  # by the other cloud: one search tree is held at a time
         for rows in np.split(order, np.flatnonzero(np.diff(others[order])) + 1):
-            tree = KDTree(sides[1 - way][others[rows[0]]].points)
+            tree = KDTree(sides[1 - way][int(others[rows[0]])].points)
             for n in rows.tolist():
                 poses = T_old_new[n] if way == 0 else np.linalg.inv(T_old_new[n])
                 moved = [apply_pose(T, samples[way][pairs[n, way]]) for T in poses]

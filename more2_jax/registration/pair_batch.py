@@ -100,8 +100,7 @@ def local_batch(
     )  # on the host: every size would be compiled anew
     origin = np.asarray(cloud.origin)
     code = jax.tree.map(lambda *x: np.stack(x), *(objects[k].embedding for k in at))
-    blank = any(o.sight is not None for o in every)
-    sight = padded_sights([o.sight for o in objects], origin, blank)
+    sight = padded_sights([o.sight for o in objects], origin, any(o.sight is not None for o in every))
     return batch_of(cloud, code, sight)
 
 

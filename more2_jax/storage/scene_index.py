@@ -134,9 +134,11 @@ def load_index(path: Path) -> SceneIndex:
     try:
         with np.load(path, allow_pickle=False) as file:
             version = int(file["version"])
-            arrays = {f.name: file[f.name] for f in dataclasses.fields(SceneIndex)}
+            prior = str(file["prior"])
+            names = [f.name for f in dataclasses.fields(SceneIndex) if f.name != "prior"]
+            arrays = {name: file[name] for name in names}
     except DAMAGE as error:
         raise ValueError(f"{path}: not an index ({' '.join(str(error).split())})") from error
     if version != VERSION:
         raise ValueError(f"{path}: version {version} of an index; needed {VERSION}")
-    return SceneIndex(**arrays | {"prior": str(arrays["prior"])})
+    return SceneIndex(prior=prior, **arrays)
