@@ -185,7 +185,8 @@ def reconstruct(
         for start in range(0, len(align), CLOSED_AT_ONCE):
             some = align[start : start + CLOSED_AT_ONCE]
             several = list(accumulated_objects(objects, some, scene.scans))
-            objects = with_refined(objects, some, refine_object_poses(prior, several, config))
+            refined = refine_object_poses(prior, several, config)
+            objects = with_refined(objects, some, refined)
     with staged(timing, progress, "joint", len(fit)):
         fitted = fit_objects(prior, list(accumulated_objects(objects, fit, scene.scans)), config)
         objects = with_refined(objects, fit, fitted)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import jax
 import jaxlie
@@ -22,6 +23,7 @@ from more2_jax.matching.calibration import Compared, calibrated
 from more2_jax.matching.color import color_evidence
 from more2_jax.matching.metric_evidence import (
     MetricEvidence,
+    Samples,
     Seen,
     metric_evidence,
     samples_of,
@@ -123,28 +125,43 @@ def align_candidates(
     worth = proposed(old, new, matcher, T if place is None else place)
     rows = worth.pairs[:, ::-1]
     (instances, of_new), (objects, of_old) = (prepared(side, matcher.search) for side in (new, old))
-    ends = of_old[rows[:, 1]], of_new[rows[:, 0]]
+    ready, ends = (instances, objects), (of_old[rows[:, 1]], of_new[rows[:, 0]])
     stayed = local_poses(np.broadcast_to(T, (len(rows), 4, 4)), *ends)
-    found = search_poses(instances, objects, stayed, matcher.search, motion, rows)
-    found, off, own = told_by_prior(prior, (instances, objects), rows, found, matcher.search, motion)
+    found = search_poses(*ready, stayed, matcher.search, motion, rows)
+    found, off, own = told_by_prior(prior, ready, rows, found, matcher.search, motion)
     T_old_new = world_poses(found.poses, ends[0][:, None], ends[1][:, None])
     seen = (seen or seen_in(old, new)) if motion == "upright" else None
     samples = samples_of(instances, of_new), samples_of(objects, of_old)
     return AlignedPairs(
         rows=worth.pairs,
         sides=(new, old),
-        ready=(instances, objects),
+        ready=ready,
         stayed=stayed,
         found=found,
         T_old_new=T_old_new,
-        seen=seen,
-        metric=metric_evidence((new, old), samples, rows, T_old_new, seen),
-        compared=compared(old, new, worth),
-        top_gap_m=heights(old)[1][worth.pairs[:, 0]] - heights(new)[1][worth.pairs[:, 1]],
         off=off,
         off_own=own,
-        height_m=0.0 if T_scene_scan is None else float(T_scene_scan[2, 3]),
+        height_m=float(T[2, 3]),
+        **known_of(worth, (new, old), samples, T_old_new, seen),
     )
+
+
+def known_of(
+    worth: Proposed,
+    sides: tuple[Sequence[ObservedObject], Sequence[ObservedObject]],
+    samples: tuple[Samples, Samples],
+    T_old_new: Float[np.ndarray, "p k 4 4"],
+    seen: Seen | None,
+) -> dict[str, Any]:
+    """What clouds and codes say of the proposed pairs; of instances and objects, as `metric_evidence` takes them."""
+    new, old = sides
+    k, i = worth.pairs.T
+    return {
+        "metric": metric_evidence(sides, samples, worth.pairs[:, ::-1], T_old_new, seen),
+        "compared": compared(old, new, worth),
+        "top_gap_m": heights(old)[1][k] - heights(new)[1][i],
+        "seen": seen,
+    }
 
 
 def told_by_prior(
