@@ -12,7 +12,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from rich.console import Console
 from rich.progress import track
 from rich.table import Table
@@ -26,7 +26,7 @@ from eval.harness.options import Masks
 from eval.harness.plots import draw_reliability
 from eval.scores.reliability import Bin, calibration_error, reliability
 from more2_jax.config import EvidenceMatcher, SceneConfig, preset
-from more2_jax.matching.assignment import NEVER, assign
+from more2_jax.matching.assignment import NEVER, LogOdds, assign
 from more2_jax.matching.calibration import FREE, UNASKED, UNKNOWN, UPRIGHT, Calibration, features, weighed
 from more2_jax.matching.candidates import compared_at, evidence_at
 from more2_jax.matching.pair_evidence import asks_prior
@@ -145,7 +145,9 @@ def scan_pair(
     compared = compared_at(aligned, height_m)
     known = features(evidence_at(aligned, matcher.search, config.motion, height_m), compared)
     sure = aligned.off_own <= UNKNOWN
-    return ScanPair(room=room, among=aligned.among, known=known, color=compared.color, sure=sure, one=one)
+    among = np.zeros(aligned.shape, bool)
+    among[tuple(aligned.rows.T)] = True
+    return ScanPair(room=room, among=among, known=known, color=compared.color, sure=sure, one=one)
 
 
 def evidence_matcher(config: SceneConfig) -> EvidenceMatcher:
@@ -274,14 +276,20 @@ def counts(rooms: Sequence[tuple[np.ndarray, np.ndarray]]) -> tuple[float, float
     """Recall, precision and F1 of the assignments; a copy stands in for another, each once."""
     right = said = true = 0
     for odds, one in rooms:
-        pairs = assign(odds, np.zeros(odds.shape), 0.0)
+        pairs = assigned(odds)
         right, said, true = right + one[tuple(pairs.T)].sum(), said + len(pairs), true + most(one)
     return right / max(true, 1), right / max(said, 1), 2 * right / max(said + true, 1)
 
 
 def most(one: Bool[np.ndarray, "n m"]) -> int:
     """As many pairs as can be right at the same time."""
-    return len(assign(np.where(one, 1.0, NEVER), np.zeros(one.shape), 0.0))
+    return len(assigned(np.where(one, 1.0, NEVER)))
+
+
+def assigned(odds: Float[np.ndarray, "n m"]) -> Int[np.ndarray, "q 2"]:
+    """The likeliest assignment, wherever things moved."""
+    listed = LogOdds.of(odds)
+    return assign(listed, np.zeros(len(listed.value)), 0.0)
 
 
 if __name__ == "__main__":

@@ -212,6 +212,9 @@ class SceneConfig:
     static_m: float = 0.05  # and moved by less, is static
     # Match and register against all seen so far, not the reference observation.
     accumulate_target: bool = False
+    # What pairs that are registered together, and objects that are meshed side by side, may take of the memory beside
+    # the scene; results do not depend on it.
+    memory_mb: int = 1024
     # Join what masks split, divide what they merge, leave out floor and neighbors, take in what they cut off.
     repair_masks: bool = False
     accumulate_misfit: float = 1.0  # an observation whose registration fits worse is left out of the shape

@@ -53,6 +53,7 @@ from more2_jax.types import (
     Skipped,
 )
 
+CLOSED_AT_ONCE = 64  # objects whose poses are refined at a time: what they take beside the scene, a MB each
 BACKGROUND_POINTS = 20_000  # of a scan, remembered for the page and for what its sensors looked through
 
 
@@ -182,9 +183,11 @@ def reconstruct(
     again = [k for k in todo if len(accumulated(objects[k])) > 1]
     align, fit = again if config.pose_graph.steps else [], again if config.joint.steps else []
     with staged(timing, progress, "close", len(align)):
-        several = list(accumulated_objects(objects, align, scene.scans))
-        refined = refine_object_poses(prior, several, config)
-        objects = with_refined(objects, align, refined)
+        for start in range(0, len(align), CLOSED_AT_ONCE):
+            some = align[start : start + CLOSED_AT_ONCE]
+            several = list(accumulated_objects(objects, some, scene.scans))
+            refined = refine_object_poses(prior, several, config)
+            objects = with_refined(objects, some, refined)
     with staged(timing, progress, "joint", len(fit)):
         fitted = fit_objects(prior, list(accumulated_objects(objects, fit, scene.scans)), config)
         objects = with_refined(objects, fit, fitted)

@@ -13,7 +13,7 @@ import tyro
 from tyro.conf import OmitArgPrefixes, OmitSubcommandPrefixes, Positional, arg, subcommand
 
 from more2_jax.cli import living_scenes as building
-from more2_jax.cli import priors, scenes
+from more2_jax.cli import places, priors, scenes
 from more2_jax.cli.options import Reading, Reporting
 from more2_jax.cli.session import one_line
 from more2_jax.cli.settings import scene_config
@@ -189,6 +189,46 @@ class Export:
 
 
 @dataclass(frozen=True)
+class Index:
+    """One file that says what the objects of many living scenes are like and where they stand.
+
+    Example: more2 index offices/room_1 offices/room_2 --out offices.npz
+    """
+
+    folders: Positional[tuple[Path, ...]]
+    """The living scenes."""
+    out: Path
+    """The file to write; one of that name is replaced."""
+
+    def __call__(self) -> int:
+        places.index(self.folders, self.out)
+        return 0
+
+
+@dataclass(frozen=True)
+class Find:
+    """Where is this chair now? The objects of an index that are most like one of a living scene.
+
+    Example: more2 find offices.npz offices/room_1 object_003
+    """
+
+    index: Positional[Path]
+    """What `more2 index` wrote."""
+    folder: Positional[Path]
+    """A living scene that knows the object,"""
+    object: Positional[str]
+    """and the object's id there."""
+    top: int = 5
+    """How many to show."""
+    everywhere: bool = False
+    """Also those of the same scene."""
+
+    def __call__(self) -> int:
+        places.find(self.index, self.folder, self.object, self.top, self.everywhere)
+        return 0
+
+
+@dataclass(frozen=True)
 class PriorList:
     """The weights inside the package.
 
@@ -288,6 +328,8 @@ Command = (
     | Annotated[Inspect, subcommand("inspect")]
     | Annotated[Show, subcommand("show")]
     | Annotated[Export, subcommand("export")]
+    | Annotated[Index, subcommand("index")]
+    | Annotated[Find, subcommand("find")]
     | Annotated[Settings, subcommand("settings")]
     | Annotated[PriorCommand, subcommand("prior")]
 )

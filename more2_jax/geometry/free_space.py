@@ -11,15 +11,17 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from scipy.ndimage import minimum_filter
 from scipy.spatial import KDTree
 
+from more2_jax.geometry.near_points import NearPoints
 from more2_jax.geometry.poses import Points
 from more2_jax.types import Sight
 
@@ -37,7 +39,15 @@ MARGIN_M, MARGIN_PER_M2 = (
 )  # noise of a depth camera: constant, and with the square of the distance
 
 
-def sight_of(cloud: Points, room: Points, sensors: Points) -> Sight | None:
+@dataclass(frozen=True, kw_only=True)
+class Around:
+    """What of a large scan may stand around an object: the points in some of its cells."""
+
+    scan: NearPoints
+    cells: Int[np.ndarray, " c"]
+
+
+def sight_of(cloud: Points, room: Points | Around, sensors: Points) -> Sight | None:
     """What sensors (positions) saw around a cloud, `room` being all points of the scan; all in its frame, meters.
 
     `VIEWS` sensors at most are asked. None where none of them stands clear of the cloud.
@@ -60,7 +70,7 @@ def spread(sensors: Sequence[np.ndarray], center: Float[np.ndarray, "3"]) -> lis
     return chosen
 
 
-def view_of(cloud: Points, room: Points, eye: Float[np.ndarray, "3"]) -> Sight | None:
+def view_of(cloud: Points, room: Points | Around, eye: Float[np.ndarray, "3"]) -> Sight | None:
     """The view of one sensor, unbatched. None where the cloud comes too near it or nearly around it."""
     turn = axes_toward(cloud.mean(axis=0) - eye)
     own = (cloud - eye) @ turn.T
@@ -70,6 +80,8 @@ def view_of(cloud: Points, room: Points, eye: Float[np.ndarray, "3"]) -> Sight |
     half = IMAGE_MARGIN * float(np.abs(image).max()) + 1e-6
     spacing = float(np.median(KDTree(image).query(image, k=2)[0][:, 1])) if len(image) > 1 else half
     side = int(np.clip(2 * half / (PIXEL_SPACINGS * spacing + 1e-9), MIN_PIXELS, PIXELS))
+    if isinstance(room, Around):
+        room = room.scan.in_view(room.cells, eye, turn[2], half)
     seen = (room - eye) @ turn.T
     seen = seen[seen[:, 2] > MIN_DEPTH_M]
     pixel = np.floor((seen[:, :2] / seen[:, 2:] / half + 1) / 2 * side).astype(int)
@@ -107,12 +119,14 @@ def stacked(views: Sequence[Sight]) -> Sight | None:
     return Sight(**{f.name: np.stack([getattr(v, f.name) for v in views]) for f in dataclasses.fields(Sight)})
 
 
-def padded_sights(sights: Sequence[Sight | None], origins: Float[np.ndarray, "b 3"]) -> Sight | None:
+def padded_sights(
+    sights: Sequence[Sight | None], origins: Float[np.ndarray, "b 3"], always: bool = False
+) -> Sight | None:
     """One of `VIEWS` views for every row of a batch, about its origin, float32; views without free space fill up.
 
-    None where no row has any.
+    None where no row has any, unless `always`.
     """
-    if all(s is None for s in sights):
+    if not always and all(s is None for s in sights):
         return None
     blank = Sight(
         eye=np.zeros((VIEWS, 3)),

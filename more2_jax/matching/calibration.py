@@ -54,14 +54,14 @@ UNKNOWN = 0.5  # of `off_own`: a prior that lays a cloud so far off its own surf
 
 # Logistic regression on pairs of validation rooms; how, and how well it holds, is in docs/relocalization.md.
 UPRIGHT = Calibration(
-    intercept=7.0,
-    likeness=1.3,
-    apart_less=-5.1,
-    apart_more=-1.2,
-    contradicted=-6.4,
+    intercept=8.2,
+    likeness=0.9,
+    apart_less=-6.6,
+    apart_more=-2.6,
+    contradicted=-4.1,
     lift=-2.5,
-    top=-2.9,
-    raised=2.0,
+    top=-3.0,
+    raised=2.25,
 )
 FREE = Calibration(
     intercept=7.7,

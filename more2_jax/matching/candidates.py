@@ -9,40 +9,61 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import jax
+import jaxlie
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from more2_jax.config import EvidenceMatcher, MotionModel, SurfaceSearch
-from more2_jax.geometry.poses import Pose
-from more2_jax.matching.assignment import NEVER, LogOdds
+from more2_jax.geometry.poses import Pose, local_poses, world_poses
+from more2_jax.matching.assignment import LogOdds, listed_at
 from more2_jax.matching.calibration import Compared, calibrated
 from more2_jax.matching.color import color_evidence
-from more2_jax.matching.metric_evidence import MetricEvidence, Seen, metric_evidence, seen_in
+from more2_jax.matching.metric_evidence import (
+    MetricEvidence,
+    Samples,
+    Seen,
+    metric_evidence,
+    samples_of,
+    seen_in,
+)
 from more2_jax.matching.pair_evidence import (
     PairEvidence,
     asks_prior,
     off_completed_surfaces,
     off_own_surface,
 )
+from more2_jax.matching.proposals import Proposed, proposed
 from more2_jax.network.prior import Prior, check_embedding
-from more2_jax.registration.pair_batch import PairBatch, local_batch, paired_rows, take_pairs
+from more2_jax.registration.pair_batch import PairBatch, host_origin, local_batch
 from more2_jax.registration.pose_costs import LIFTED
-from more2_jax.registration.search import AlignableObject, FoundPoses, alignable, search_poses
-from more2_jax.types import LocalBatch, ObservedObject
+from more2_jax.registration.search import (
+    AlignableObject,
+    FoundPoses,
+    alignable,
+    rows_taken,
+    search_poses,
+)
+from more2_jax.types import ObservedObject
 
 TOP = 0.99  # share of a cloud's points below its top
+OBJECTS_AT_ONCE = 64  # padded and prepared at a time
 
 
 @dataclass(frozen=True, kw_only=True)
 class AlignedPairs:
-    """The pairs of objects (n) and instances (m) that were aligned, and all that is known of them; p pairs."""
+    """The pairs of objects (n) and instances (m) that were aligned, and all that is known of them; p pairs.
 
-    among: Bool[np.ndarray, "n m"]  # which pairs these are; they are listed row by row
-    pairs: PairBatch  # instances onto objects, with the poses found
-    objects: tuple[AlignableObject, AlignableObject]  # instances and objects of the pairs, (p, …)
-    found: FoundPoses  # (p, k), local frames
+    What was prepared is held once an object, whatever number of pairs it is part of.
+    """
+
+    rows: Int[np.ndarray, "p 2"]  # (object, instance), by objects, then by instances
+    sides: tuple[Sequence[ObservedObject], Sequence[ObservedObject]]  # instances (m) and objects (n)
+    ready: tuple[AlignableObject, AlignableObject]  # prepared; what sensors saw only where a search asks
+    stayed: jaxlie.SE3  # (p,): "it did not move", an instance's local frame to the object's
+    found: FoundPoses  # (p, k), local frames: instances onto objects
     T_old_new: Float[np.ndarray, "p k 4 4"]  # those poses between the clouds' frames, float64
     compared: Compared
     top_gap_m: Float[np.ndarray, " p"]  # by how much the object's top is higher than the instance's
@@ -52,14 +73,35 @@ class AlignedPairs:
     seen: Seen | None = None  # what both scans saw; None where that is no evidence (any orientation)
     height_m: float = 0.0  # upright: that the scan was taken to lie at
 
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Numbers of objects and of instances."""
+        return len(self.sides[1]), len(self.sides[0])
+
     def take(self, chosen: Sequence[tuple[int, int]]) -> PairBatch:
         """Some pairs (object, instance) as registration takes them: with the poses found, and as prepared."""
-        whole = dataclasses.replace(self.pairs, candidates=self.found.poses, prepared=self.objects)
-        return take_pairs(whole, [self.row_of(k, i) for k, i in chosen])
+        at = self.rows_of(chosen)
+        ends = self.rows[at, 1], self.rows[at, 0]
+        source, target = (
+            local_batch([side[k] for k in end], len(end), side)
+            for side, end in zip(self.sides, ends, strict=True)
+        )
+        ready = rows_taken(self.ready, np.stack(ends, axis=1))
+        sights = source.sight, target.sight
+        stayed, poses = jax.tree.map(lambda x: x[at], (self.stayed, self.found.poses))
+        return PairBatch(
+            source=source,
+            target=target,
+            stayed=stayed,
+            candidates=poses,
+            prepared=tuple(  # pyright: ignore[reportArgumentType]
+                dataclasses.replace(r, sight=s) for r, s in zip(ready, sights, strict=True)
+            ),
+        )
 
-    def row_of(self, object_row: int, instance_row: int) -> int:
-        """Where a pair is listed."""
-        return int(self.among.ravel()[: object_row * self.among.shape[1] + instance_row].sum())
+    def rows_of(self, chosen: Sequence[tuple[int, int]]) -> Int[np.ndarray, " c"]:
+        """Where pairs (object, instance) are listed."""
+        return listed_at(self.rows, np.reshape(np.asarray(chosen, int), (-1, 2)), self.shape[1])
 
 
 def align_candidates(
@@ -70,43 +112,61 @@ def align_candidates(
     motion: MotionModel,
     T_scene_scan: Pose | None = None,
     seen: Seen | None = None,
+    place: Pose | None = None,
 ) -> AlignedPairs:
     """Aligns the likeliest pairs of `old` (scene's frame) and `new` (scan's frame).
 
     `T_scene_scan`: how the scan is taken to lie, for what did not move; by default in the scene's frame. `seen`: what
-    both scans show, upright; by default objects and instances alone. Raises ValueError as `check_asked` does.
+    both scans show, upright; by default objects and instances alone. `place`: the same motion as far as it says where
+    partners are sought (`proposals`), by default `T_scene_scan`. Raises ValueError as `check_asked` does.
     """
     check_asked(prior, (*old, *new), matcher, motion)
-    known = compared(old, new)
-    among = proposed(proposal_of(known, matcher), matcher.candidates)
-    rows = np.argwhere(among)[:, ::-1]
-    sides, ready = prepared((new, old), matcher.search)
-    pairs = paired_rows(*sides, rows, np.eye(4) if T_scene_scan is None else T_scene_scan)
-    objects = taken(ready[0], rows[:, 0]), taken(ready[1], rows[:, 1])
-    found = search_poses(*objects, pairs.stayed, matcher.search, motion)
+    T = np.eye(4) if T_scene_scan is None else T_scene_scan
+    worth = proposed(old, new, matcher, T if place is None else place)
+    rows = worth.pairs[:, ::-1]
+    (instances, of_new), (objects, of_old) = (prepared(side, matcher.search) for side in (new, old))
+    ready, ends = (instances, objects), (of_old[rows[:, 1]], of_new[rows[:, 0]])
+    stayed = local_poses(np.broadcast_to(T, (len(rows), 4, 4)), *ends)
+    found = search_poses(*ready, stayed, matcher.search, motion, rows)
     found, off, own = told_by_prior(prior, ready, rows, found, matcher.search, motion)
-    T_old_new = pairs.to_world(found.poses)
+    T_old_new = world_poses(found.poses, ends[0][:, None], ends[1][:, None])
     seen = (seen or seen_in(old, new)) if motion == "upright" else None
-    metric = metric_evidence((new, old), sides, ready, rows, T_old_new, seen)
+    samples = samples_of(instances, of_new), samples_of(objects, of_old)
     return AlignedPairs(
-        among=among,
-        pairs=pairs,
-        objects=objects,
+        rows=worth.pairs,
+        sides=(new, old),
+        ready=ready,
+        stayed=stayed,
         found=found,
         T_old_new=T_old_new,
-        seen=seen,
-        metric=metric,
-        compared=Compared(**{k: v[among] for k, v in vars(known).items()}),
-        top_gap_m=(heights(old)[1][:, None] - heights(new)[1])[among],
         off=off,
         off_own=own,
-        height_m=0.0 if T_scene_scan is None else float(T_scene_scan[2, 3]),
+        height_m=float(T[2, 3]),
+        **known_of(worth, (new, old), samples, T_old_new, seen),
     )
+
+
+def known_of(
+    worth: Proposed,
+    sides: tuple[Sequence[ObservedObject], Sequence[ObservedObject]],
+    samples: tuple[Samples, Samples],
+    T_old_new: Float[np.ndarray, "p k 4 4"],
+    seen: Seen | None,
+) -> dict[str, Any]:
+    """What clouds and codes say of the proposed pairs; of instances and objects, as `metric_evidence` takes them."""
+    new, old = sides
+    k, i = worth.pairs.T
+    return {
+        "metric": metric_evidence(sides, samples, worth.pairs[:, ::-1], T_old_new, seen),
+        "compared": compared(old, new, worth),
+        "top_gap_m": heights(old)[1][k] - heights(new)[1][i],
+        "seen": seen,
+    }
 
 
 def told_by_prior(
     prior: Prior,
-    ready: Sequence[AlignableObject],
+    ready: tuple[AlignableObject, AlignableObject],
     rows: Int[np.ndarray, "p 2"],
     found: FoundPoses,
     search: SurfaceSearch,
@@ -118,26 +178,27 @@ def told_by_prior(
     """
     if not asks_prior(search, motion):
         return found, np.zeros((*found.cost.shape, 2)), np.zeros(len(found.cost))
-    sides = list(zip(ready, rows.T, strict=True))
-    source, target = (taken(x, at) for x, at in sides)
-    found, off = off_completed_surfaces(prior, source, target, found, search)
-    return found, off, np.max([off_own_surface(prior, x)[at] for x, at in sides], axis=0)
+    found, off = off_completed_surfaces(prior, ready, rows, found, search)
+    own = [off_own_surface(prior, x)[at] for x, at in zip(ready, rows.T, strict=True)]
+    return found, off, np.max(own, axis=0)
 
 
 def prepared(
-    sides: tuple[Sequence[ObservedObject], Sequence[ObservedObject]], search: SurfaceSearch
-) -> tuple[tuple[LocalBatch, LocalBatch], tuple[AlignableObject, AlignableObject]]:
-    """Both sides as batches, and their objects ready to be aligned, without the batches' fillers."""
-    first, second = (local_batch(side) for side in sides)
-    ready = (
-        alignable(b.take(np.arange(len(s))), search) for b, s in zip((first, second), sides, strict=True)
-    )
-    return (first, second), tuple(ready)  # pyright: ignore[reportReturnType]
+    side: Sequence[ObservedObject], search: SurfaceSearch
+) -> tuple[AlignableObject, Float[np.ndarray, "b 3"]]:
+    """The objects of one scan ready to be aligned, and the origins of their local frames.
 
-
-def taken(objects: AlignableObject, rows: Int[np.ndarray, " p"]) -> AlignableObject:
-    """The objects in `rows`, in that order."""
-    return jax.tree.map(lambda x: x[rows], objects)
+    `OBJECTS_AT_ONCE` are padded at a time; without what sensors saw, which only a search with a `free_weight` reads.
+    """
+    ready, origins = list[AlignableObject](), list[np.ndarray]()
+    for start in range(0, len(side), OBJECTS_AT_ONCE):
+        some = side[start : start + OBJECTS_AT_ONCE]
+        batch = local_batch(some, len(some), side)
+        origins.append(host_origin(batch))
+        ready.append(
+            alignable(batch if search.free_weight else dataclasses.replace(batch, sight=None), search)
+        )
+    return jax.tree.map(lambda *x: np.concatenate(x), *ready), np.concatenate(origins)
 
 
 def check_asked(
@@ -152,14 +213,10 @@ def check_asked(
 def odds_of(
     aligned: AlignedPairs, search: SurfaceSearch, motion: MotionModel, height_m: float = 0.0
 ) -> LogOdds:
-    """Log odds of every pair to be one object, upright with `height_m` added to the new scan's heights.
-
-    `NEVER` for pairs that were not aligned.
-    """
+    """Log odds of every aligned pair to be one object, upright with `height_m` added to the new scan's heights."""
     evidence = evidence_at(aligned, search, motion, height_m)
-    odds = np.full(aligned.among.shape, NEVER)
-    odds[aligned.among] = calibrated(evidence, compared_at(aligned, height_m), search, motion)
-    return odds
+    value = calibrated(evidence, compared_at(aligned, height_m), search, motion)
+    return LogOdds(pairs=aligned.rows, value=value, shape=aligned.shape)
 
 
 def compared_at(aligned: AlignedPairs, height_m: float) -> Compared:
@@ -171,9 +228,9 @@ def evidence_at(
     aligned: AlignedPairs, search: SurfaceSearch, motion: MotionModel, height_m: float = 0.0
 ) -> PairEvidence:
     """What the best pose of every pair says, upright at a common height."""
-    found, radius = aligned.found, np.asarray(aligned.objects[1].radius)
+    found, radius = aligned.found, np.asarray(aligned.ready[1].radius)[aligned.rows[:, 0]]
     z = np.asarray(found.poses.translation()[..., 2])
-    stayed = np.asarray(aligned.pairs.stayed.translation()[..., 2])[:, None]
+    stayed = np.asarray(aligned.stayed.translation()[..., 2])[:, None]
     lift = np.abs(z - stayed - (height_m - aligned.height_m))
     best = np.zeros(len(z), int)  # as they are ordered
     if motion == "upright":
@@ -200,35 +257,20 @@ def height_penalty(
     return search.lift_weight * np.minimum(lift_m / (LIFTED * radius_m[:, None]), 1.0)
 
 
-def proposal_of(known: Compared, matcher: EvidenceMatcher) -> LogOdds:
-    """By what the embeddings propose pairs: likeness, less a difference in size."""
-    return known.likeness - matcher.size_weight * known.size
-
-
 def heights(side: Sequence[ObservedObject]) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
     """Heights of every cloud's lowest and highest points, meters."""
     low, high = np.array([np.quantile(o.points[:, 2], (1 - TOP, TOP)) for o in side]).T
     return low, high
 
 
-def compared(old: Sequence[ObservedObject], new: Sequence[ObservedObject]) -> Compared:
-    """Every object with every instance, by size, code, height and color."""
+def compared(old: Sequence[ObservedObject], new: Sequence[ObservedObject], worth: Proposed) -> Compared:
+    """The proposed pairs by size, code, height and color."""
+    k, i = worth.pairs.T
     a, b = (np.array([float(o.embedding.scale) for o in side]) for side in (old, new))
-    x, y = (np.stack([np.asarray(o.embedding.inv, np.float64) for o in side]) for side in (old, new))
-    x, y = (v / np.maximum(np.linalg.norm(v, axis=1, keepdims=True), 1e-30) for v in (x, y))
     (_, top), (_, other) = heights(old), heights(new)
     return Compared(
-        size=np.abs(np.log(a[:, None] / b)),
-        likeness=x @ y.T,
-        top_m=np.abs(top[:, None] - other),
-        color=color_evidence([o.color for o in old], [o.color for o in new]),
+        size=np.abs(np.log(a[k] / b[i])),
+        likeness=worth.likeness,
+        top_m=np.abs(top[k] - other[i]),
+        color=color_evidence([o.color for o in old], [o.color for o in new], worth.pairs),
     )
-
-
-def proposed(score: LogOdds, count: int) -> Bool[np.ndarray, "n m"]:
-    """True for the best `count` of every row and of every column; all where `count` is 0."""
-    if not count:
-        return np.ones(score.shape, bool)
-    rows = np.argsort(np.argsort(-score, axis=1, kind="stable"), axis=1) < count
-    columns = np.argsort(np.argsort(-score, axis=0, kind="stable"), axis=0) < count
-    return rows | columns

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Float, Integer
+from jaxtyping import Float, Int, Integer
 from skimage.color import rgb2lab
 
 from more2_jax.types import Color
@@ -36,8 +36,10 @@ def pooled(*parts: Color | None) -> Color | None:
     return Color(points=int(count.sum()), lab=count @ np.stack([c.lab for c in known]) / count.sum())
 
 
-def color_evidence(old: Sequence[Color | None], new: Sequence[Color | None]) -> Float[np.ndarray, "n m"]:
-    """Log likelihood ratio of every pair's colors: one object against two; 0 where either has none.
+def color_evidence(
+    old: Sequence[Color | None], new: Sequence[Color | None], pairs: Int[np.ndarray, "p 2"]
+) -> Float[np.ndarray, " p"]:
+    """Log likelihood ratio of the colors of pairs: one object against two; 0 where either has none.
 
     The difference of one object's colors is normal (`SAME`), but with probability `ODD` that of two objects;
     so no pair loses more than log `ODD`. Differences of two objects are normal with the spread of the room's own
@@ -46,7 +48,7 @@ def color_evidence(old: Sequence[Color | None], new: Sequence[Color | None]) -> 
     """
     a, b = (np.stack([np.full(3, np.nan) if c is None else c.lab for c in side]) for side in (old, new))
     different = np.clip(np.minimum(_spread(a), _spread(b)), SAME, DIFFERENT)
-    squared = (a[:, None] - b) ** 2
+    squared = (a[pairs[:, 0]] - b[pairs[:, 1]]) ** 2
     exponent = 0.5 * (squared * (different**-2 - SAME**-2)).sum(axis=-1)
     alike = exponent + np.log(different / SAME).sum()
     ratio = np.logaddexp(np.log1p(-ODD) + np.nan_to_num(alike), np.log(ODD))

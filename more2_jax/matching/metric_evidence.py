@@ -18,10 +18,11 @@ from scipy.spatial import KDTree
 from more2_jax.geometry.poses import Points, apply_pose
 from more2_jax.geometry.seen_space import SeenSpace
 from more2_jax.registration.search import AlignableObject
-from more2_jax.types import LocalBatch, ObservedObject
+from more2_jax.types import ObservedObject
 
 APART_M = 0.08  # a point farther from the other cloud counts as this far; chosen as `seen_space.CELL_M`
 
+Samples = list[Float[np.ndarray, "_ 3"]]
 Seen = tuple[SeenSpace, SeenSpace]  # of the scene so far, and of the new scan, each in its own frame
 
 
@@ -56,45 +57,42 @@ class MetricEvidence:
 
 def metric_evidence(
     sides: tuple[Sequence[ObservedObject], Sequence[ObservedObject]],
-    batches: tuple[LocalBatch, LocalBatch],
-    ready: tuple[AlignableObject, AlignableObject],
+    samples: tuple[Samples, Samples],
     pairs: Int[np.ndarray, "p 2"],
     T_old_new: Float[np.ndarray, "p k 4 4"],
     seen: Seen | None,
 ) -> MetricEvidence:
-    """Compares samples of instances and objects with all of the other cloud, and of the other scan.
+    """Compares samples of instances and objects with the other cloud and what lies around it, and with the other scan.
 
-    `sides`, `batches`, `ready`: instances (new scan's frame), then objects (scene's frame). `pairs`: rows of both.
+    `sides`, `samples`: of instances (new scan's frame), then of objects (scene's frame). `pairs`: rows of both.
     Without `seen` nothing is known to be empty.
     """
-    trees = [[KDTree(o.points) for o in side] for side in sides]
-    samples = [samples_of(x, b, len(side)) for x, b, side in zip(ready, batches, sides, strict=True)]
     apart = np.zeros((*T_old_new.shape[:2], 2))
     empty = np.zeros_like(apart)
     for way in (0, 1):
-        poses = T_old_new if way == 0 else np.linalg.inv(T_old_new)
-        moved = [
-            apply_pose(T, samples[way][pair[way]])
-            for pair, of_pair in zip(pairs, poses, strict=True)
-            for T in of_pair
-        ]
-        others = np.repeat(pairs[:, 1 - way], T_old_new.shape[1])
-        apart[..., way] = np.reshape(
-            [mean_apart(trees[1 - way][int(o)], p) for o, p in zip(others, moved, strict=True)],
-            apart.shape[:2],
-        )
-        if seen is not None:
-            ends = np.cumsum([len(p) for p in moved])[:-1]
-            lies_empty = np.split(seen[way].empty(np.concatenate(moved), APART_M), ends)
-            empty[..., way] = np.reshape([e.mean() for e in lies_empty], apart.shape[:2])
+        others = pairs[:, 1 - way]
+        order = np.argsort(others, kind="stable")  # by the other cloud: one search tree is held at a time
+        for rows in np.split(order, np.flatnonzero(np.diff(others[order])) + 1):
+            tree = KDTree(all_around(sides[1 - way][int(others[rows[0]])]))
+            for n in rows.tolist():
+                poses = T_old_new[n] if way == 0 else np.linalg.inv(T_old_new[n])
+                moved = [apply_pose(T, samples[way][pairs[n, way]]) for T in poses]
+                apart[n, :, way] = [mean_apart(tree, p) for p in moved]
+                if seen is not None:
+                    lies_empty = seen[way].empty(np.concatenate(moved), APART_M)
+                    empty[n, :, way] = lies_empty.reshape(len(poses), -1).mean(axis=1)
     return MetricEvidence(apart=apart, contradicted=empty.max(axis=-1))
 
 
-def samples_of(ready: AlignableObject, batch: LocalBatch, count: int) -> list[Float[np.ndarray, "_ 3"]]:
-    """What the search compares of every object, in its scan's frame; float64."""
+def all_around(o: ObservedObject) -> Points:
+    """An object's points and what lies around it: a mask may have lost what its scan still shows."""
+    return o.points if o.around is None else np.concatenate([o.points, o.around])
+
+
+def samples_of(ready: AlignableObject, origin: Float[np.ndarray, "b 3"]) -> Samples:
+    """What the search compares of every object, in its scan's frame; float64. `origin`: of its local frame there."""
     points, mask = np.asarray(ready.coarse.sampled.points, np.float64), np.asarray(ready.coarse.sampled.mask)
-    origin = np.zeros((len(points), 3)) if batch.origin is None else np.asarray(batch.origin, np.float64)
-    return [points[k][mask[k]] + origin[k] for k in range(count)]
+    return [points[k][mask[k]] + origin[k] for k in range(len(points))]
 
 
 def mean_apart(tree: KDTree, points: Float[np.ndarray, "n 3"]) -> float:

@@ -20,9 +20,9 @@ from jaxtyping import Array, Float, Int
 from more2_jax.config import MotionModel, SurfaceSearch
 from more2_jax.geometry.transform import rescale
 from more2_jax.network.prior import Prior
-from more2_jax.network.row_map import chunked
+from more2_jax.network.row_map import chunked, chunked_at
 from more2_jax.registration.pose_costs import field_cost, off_field, off_fields
-from more2_jax.registration.search import AlignableObject, FoundPoses, scaled_pose
+from more2_jax.registration.search import AlignableObject, FoundPoses, rows_taken, scaled_pose
 from more2_jax.types import Sampled
 
 OBJECTS_A_CALL = 2
@@ -55,14 +55,22 @@ def asks_prior(search: SurfaceSearch, motion: MotionModel) -> bool:
 
 
 def off_completed_surfaces(
-    prior: Prior, source: AlignableObject, target: AlignableObject, found: FoundPoses, search: SurfaceSearch
+    prior: Prior,
+    sides: tuple[AlignableObject, AlignableObject],
+    rows: Int[np.ndarray, "p 2"],
+    found: FoundPoses,
+    search: SurfaceSearch,
 ) -> tuple[FoundPoses, Float[np.ndarray, "p k 2"]]:
     """The poses of every pair in the order that the prior's surfaces give them, and `off_fields` of each.
 
-    By a few points of each cloud; of the first `LEADING` by all, which order these.
+    By a few points of each cloud; of the first `LEADING` by all, which order these. `rows`: of sources and targets.
     """
-    one_call = partial(_off_completed_surfaces, prior, search=search)
-    return chunked(one_call, PAIRS_A_CALL, (source, target, found))
+    return chunked_at(
+        partial(_off_completed_surfaces, prior, search=search),
+        PAIRS_A_CALL,
+        len(rows),
+        lambda at: (*rows_taken(sides, rows[at]), jax.tree.map(lambda x: x[at], found)),
+    )
 
 
 @partial(jax.jit, static_argnames="search")

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import os
+from collections import deque
 from collections.abc import Iterable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 
 import numpy as np
 from jaxtyping import Float
@@ -26,16 +27,26 @@ BELOW_FLOOR_M = 0.05
 BOX_QUANTILE = 0.99
 BOX_MARGIN = 1.15
 MAX_BOX = 3.0  # times the usual half width
-# About 70 MB each: a scene of eight objects took 662 MB one at a time, 1,131 MB all at once.
-MESHES_AT_ONCE = 8
+# A scene of eight objects took 662 MB one at a time, 1,131 MB all at once.
+MESHES_AT_ONCE, MESH_MB = 8, 70
 
 
 def object_meshes(
     prior: Prior, objects: Iterable[AccumulatedObject], config: SceneConfig
 ) -> Iterator[Mesh | None]:
-    """The objects' meshes in their order, `MESHES_AT_ONCE` worked on side by side: most steps keep one core busy."""
-    with ThreadPoolExecutor(min(MESHES_AT_ONCE, os.cpu_count() or 1)) as pool:
-        yield from pool.map(lambda o: object_mesh(prior, o, config), objects)
+    """The objects' meshes in their order, as many worked on side by side as there are cores: most steps keep one busy.
+
+    `MESHES_AT_ONCE` at most, and what `config.memory_mb` holds. Of `objects` no more are drawn than are worked on.
+    """
+    at_once = min(MESHES_AT_ONCE, os.cpu_count() or 1, max(1, config.memory_mb // MESH_MB))
+    with ThreadPoolExecutor(at_once) as pool:
+        begun = deque[Future[Mesh | None]]()
+        for o in objects:
+            begun.append(pool.submit(object_mesh, prior, o, config))
+            if len(begun) > at_once:
+                yield begun.popleft().result()
+        while begun:
+            yield begun.popleft().result()
 
 
 def object_mesh(prior: Prior, o: AccumulatedObject, config: SceneConfig) -> Mesh | None:

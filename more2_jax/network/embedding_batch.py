@@ -12,7 +12,9 @@ from more2_jax.geometry.padding import MAX_POINTS, Rows, bucket, pad_batch, pad_
 from more2_jax.network.prior import Prior, encode
 from more2_jax.types import Embedding, PointCloud
 
-SMALLEST_BATCH = 8  # scenes of up to so many objects share their compiled programs
+SMALLEST_BATCH = (
+    8  # objects a call: scenes of any size share their compiled programs, and what these take of memory
+)
 
 
 def padded(
@@ -25,8 +27,13 @@ def padded(
 def embed(
     prior: Prior, clouds: Sequence[Rows], normals: Sequence[Rows | None] | None = None
 ) -> list[Embedding]:
-    """One embedding per cloud, in one call; `normals` as `pad_clouds` takes them."""
-    return unstack(encode(prior, padded(clouds, normals=normals)), len(clouds))
+    """One embedding per cloud, `SMALLEST_BATCH` a call; `normals` as `pad_clouds` takes them."""
+    found = list[Embedding]()
+    for start in range(0, max(len(clouds), 1), SMALLEST_BATCH):
+        some = slice(start, start + SMALLEST_BATCH)
+        batch = padded(clouds[some], normals=None if normals is None else normals[some])
+        found += unstack(encode(prior, batch), len(clouds[some]))
+    return found
 
 
 def unstack(batch: Embedding, count: int) -> list[Embedding]:

@@ -9,6 +9,7 @@ import jax
 import numpy as np
 from jax.core import Tracer
 from jax.sharding import Mesh, PartitionSpec
+from jaxtyping import Int
 
 Tree = Any  # of arrays
 WIDER = 8  # times as many rows in a call of `chunked` on an accelerator
@@ -44,14 +45,24 @@ def chunked(function: Callable[[Tree], Tree], size: int, rows: Tree) -> Tree:
     filled up with its first row; of no rows there is none. Where anything is traced, the number of rows is part of a
     larger program anyway: they go in one call. Results are host arrays, but for traced ones.
     """
-    leaves = jax.tree.leaves(rows)
     if traced(rows):
         return function(rows)
+    host = jax.tree.map(np.asarray, rows)
+    count = len(jax.tree.leaves(host)[0])
+    return chunked_at(function, size, count, lambda at: jax.tree.map(lambda x: x[at], host))
+
+
+def chunked_at(
+    function: Callable[[Tree], Tree], size: int, count: int, taken: Callable[[Int[np.ndarray, " k"]], Tree]
+) -> Tree:
+    """`chunked` of `count` rows that are made for every call anew: `taken` gives those at some places.
+
+    What many rows share (an object that is part of many pairs) is so never held once a row.
+    """
     size = size if jax.default_backend() == "cpu" else WIDER * size
-    count, devices = len(leaves[0]), jax.local_devices()
-    host, found = jax.tree.map(np.asarray, rows), []
+    devices, found = jax.local_devices(), []
     if not count:
-        return _of_no_rows(function, host)
+        return _of_no_rows(function, taken(np.zeros(0, int)))
     for wave in range(0, count, size * len(devices)):
         starts = range(wave, max(min(wave + size * len(devices), count), wave + 1), size)
         calls = []
@@ -59,10 +70,10 @@ def chunked(function: Callable[[Tree], Tree], size: int, rows: Tree) -> Tree:
             at = np.minimum(
                 np.arange(start, start + size), np.where(np.arange(size) < count - start, count, start)
             )
-            part = jax.tree.map(lambda x, at=at: x[at], host)
+            part = taken(at)
             calls.append(function(part if len(devices) == 1 else jax.device_put(part, device)))
             if traced(calls[-1]):  # by what the function closes over, or as part of a larger program
-                return function(rows)
+                return function(taken(np.arange(count)))
         for start, call in zip(starts, calls, strict=True):
             found.append(jax.tree.map(lambda x, n=count - start: x[:n], jax.device_get(call)))
     return jax.tree.map(lambda *x: np.concatenate(x), *found) if len(found) > 1 else found[0]

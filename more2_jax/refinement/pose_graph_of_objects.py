@@ -43,6 +43,19 @@ def refine_object_poses(
     Without `meshing.mls_bandwidth` there are no planes to compare; then all stays as it is. Where codes are of all
     that was accumulated, they are made anew.
     """
+    result = list[AccumulatedObject]()
+    for start in range(0, len(objects), SMALLEST_BATCH):
+        result += with_poses_refined(prior, objects[start : start + SMALLEST_BATCH], config)
+    if not (config.accumulate_target and result):
+        return result
+    codes = embed(prior, [o.points for o in result], [o.normals for o in result])
+    return [dataclasses.replace(o, embedding=code) for o, code in zip(result, codes, strict=True)]
+
+
+def with_poses_refined(
+    prior: Prior, objects: Sequence[AccumulatedObject], config: SceneConfig
+) -> list[AccumulatedObject]:
+    """A few of the objects with poses that agree: what planes and batches take of memory does not grow with a scene."""
     result = list(objects)
     with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
         surfaces = list(pool.map(lambda o: list(observation_surfaces(prior, o, config)), objects))
@@ -54,10 +67,7 @@ def refine_object_poses(
         moved = jax.device_get(optimize_pose_graphs(batch, config.pose_graph.steps, config.motion))
         for n, motions in zip(rows, moved, strict=False):  # without the batch's padding
             result[n] = with_motions(objects[n], motions, max_turn_deg(surfaces[n]))
-    if not (config.accumulate_target and result):
-        return result
-    codes = embed(prior, [o.points for o in result], [o.normals for o in result])
-    return [dataclasses.replace(o, embedding=code) for o, code in zip(result, codes, strict=True)]
+    return result
 
 
 def optimized_observations(o: AccumulatedObject) -> list[int]:

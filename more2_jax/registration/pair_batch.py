@@ -13,7 +13,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Float, Int
 
 from more2_jax.geometry.free_space import padded_sights
-from more2_jax.geometry.padding import MAX_POINTS, bucket, pad_batch, pad_clouds
+from more2_jax.geometry.padding import MAX_POINTS, bucket, pad_clouds
 from more2_jax.geometry.poses import local_poses, world_poses
 from more2_jax.network.prior import Prior, encode
 from more2_jax.registration.search import AlignableObject
@@ -82,39 +82,44 @@ def host_origin(batch: LocalBatch) -> Float[np.ndarray, "b 3"]:
     return np.asarray(batch.origin, np.float64)
 
 
-def local_batch(objects: Sequence[ObservedObject], size: int | None = None) -> LocalBatch:
+def local_batch(
+    objects: Sequence[ObservedObject],
+    size: int | None = None,
+    part_of: Sequence[ObservedObject] | None = None,
+) -> LocalBatch:
     """Objects as one batch of one shape for all scenes: (size, `MAX_POINTS`, 3), on the host.
 
-    Fillers repeat the first object; `size` is by default the next power of two.
+    Fillers repeat the first object; `size` is by default the next power of two. `part_of`: the objects of the whole
+    scan; what any of these has (normals, what sensors saw, what lies around) the batch has too, blank where its own have none.
     """
-    normals = [o.normals for o in objects]
-    known = None if all(n is None for n in normals) else normals
-    cloud = pad_batch(
-        pad_clouds([o.points for o in objects], MAX_POINTS, known), size or bucket(len(objects))
-    )
+    every = objects if part_of is None else part_of
+    known = None if all(o.normals is None for o in every) else [o.normals for o in objects]
+    padded = pad_clouds([o.points for o in objects], MAX_POINTS, known)
+    at = np.arange(size or bucket(len(objects)))
+    at = np.where(at < len(objects), at, 0)
+    cloud = jax.tree.map(
+        lambda x: np.asarray(x)[at], padded
+    )  # on the host: every size would be compiled anew
     origin = np.asarray(cloud.origin)
-    rows = [objects[k if k < len(objects) else 0].embedding for k in range(len(origin))]
-    code = jax.tree.map(lambda *x: np.stack(x), *rows)
-    batch = batch_of(jax.tree.map(np.asarray, cloud), code, padded_sights([o.sight for o in objects], origin))
-    return dataclasses.replace(batch, around=padded_around([o.around for o in objects], origin))
+    code = jax.tree.map(lambda *x: np.stack(x), *(objects[k].embedding for k in at))
+    sight = padded_sights([o.sight for o in objects], origin, any(o.sight is not None for o in every))
+    around = None
+    if any(o.around is not None for o in every):
+        around = padded_around([objects[k].around for k in at], origin)
+    return dataclasses.replace(batch_of(cloud, code, sight), around=around)
 
 
 def padded_around(
     around: Sequence[Float[np.ndarray, "_ 3"] | None], origin: Float[np.ndarray, "b 3"]
-) -> PointCloud | None:
-    """What lies around every object, about its origin; fillers have the first object's. None where nothing is known."""
-    if all(points is None for points in around):
-        return None
-    rows, masks = (
-        np.zeros((len(origin), AROUND_POINTS, 3), np.float32),
-        np.zeros((len(origin), AROUND_POINTS), bool),
-    )
-    for k, at in enumerate(origin):
-        points = around[k if k < len(around) else 0]
+) -> PointCloud:
+    """What lies around every object, about its origin, thinned evenly to `AROUND_POINTS`."""
+    rows = np.zeros((len(origin), AROUND_POINTS, 3), np.float32)
+    mask = np.zeros((len(origin), AROUND_POINTS), bool)
+    for k, points in enumerate(around):
         if points is not None and len(points):
             some = points[np.linspace(0, len(points) - 1, min(len(points), AROUND_POINTS)).astype(int)]
-            rows[k, : len(some)], masks[k, : len(some)] = some - at, True
-    return PointCloud(points=rows, mask=masks)  # type: ignore[arg-type]
+            rows[k, : len(some)], mask[k, : len(some)] = some - origin[k], True
+    return PointCloud(points=rows, mask=mask)  # type: ignore[arg-type]
 
 
 def observe(prior: Prior, clouds: Sequence[Float[np.ndarray, "_ 3"]]) -> LocalBatch:

@@ -12,13 +12,14 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import jaxlie
+import numpy as np
 from jaxtyping import Array, Float, Int
 
 from more2_jax.config import MotionModel, SurfaceSearch
 from more2_jax.geometry.point_to_plane import Surface, align_by, coarsened, surrounded, whole_surface
 from more2_jax.geometry.points import cloud_radius
 from more2_jax.geometry.transform import rescale
-from more2_jax.network.row_map import chunked
+from more2_jax.network.row_map import chunked, chunked_at
 from more2_jax.registration.pose_costs import (
     free_space_cost,
     height_cost,
@@ -84,14 +85,32 @@ def search_poses(
     stayed: jaxlie.SE3,
     search: SurfaceSearch,
     motion: MotionModel,
+    rows: Int[np.ndarray, "b 2"] | None = None,
 ) -> FoundPoses:
     """The poses of a batch of pairs, row i of `source` onto row i of `target`; meters, local frames.
 
-    `stayed` (b,): where each source would be had it not moved.
+    `stayed` (b,): where each source would be had it not moved. `rows` names the pairs (row of `source`, of `target`)
+    where an object is part of several.
     """
-    return chunked(
-        partial(_search_poses, search=search, motion=motion), PAIRS_A_CALL, (source, target, stayed)
+    one_call = partial(_search_poses, search=search, motion=motion)
+    if rows is None:
+        return chunked(one_call, PAIRS_A_CALL, (source, target, stayed))
+    return chunked_at(
+        one_call,
+        PAIRS_A_CALL,
+        len(rows),
+        lambda at: (*rows_taken((source, target), rows[at]), jax.tree.map(lambda x: x[at], stayed)),
     )
+
+
+def rows_taken(
+    sides: tuple[AlignableObject, AlignableObject], rows: Int[np.ndarray, "b 2"]
+) -> tuple[AlignableObject, AlignableObject]:
+    """Sources and targets of pairs that are named by rows of both."""
+    first, second = (
+        jax.tree.map(lambda x, at=at: x[at], side) for side, at in zip(sides, rows.T, strict=True)
+    )
+    return first, second
 
 
 @partial(jax.jit, static_argnames=("search", "motion"))

@@ -55,7 +55,7 @@ def changes_between(
 
 def not_seen_in(scans: Sequence[ScanRecord]) -> NotSeen:
     """Of every scan, the objects that it did not look for."""
-    return {s.index: s.not_seen for s in scans}
+    return {s.index: frozenset(s.not_seen) for s in scans}
 
 
 def forgotten(scene: LivingScene, ids: Collection[str]) -> LivingScene:

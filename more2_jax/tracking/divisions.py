@@ -10,9 +10,9 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
 
 from more2_jax.geometry.normalized_cut import Rows
+from more2_jax.matching.assignment import NEVER
 from more2_jax.types import Embedding
 
 # Chosen on rooms of regime `real`, docs/relocalization.md.
@@ -42,8 +42,9 @@ class Division:
     gain: float
 
 
-# Log odds (others, parts) of every part with those of the other scan's clouds that are named.
-Weigh = Callable[[Sequence[Part], Sequence[int]], Float[np.ndarray, "k p"]]
+# Log odds of parts with those of the other scan's clouds that are named, by the numbers of both in these lists:
+# (other, part). Those that cannot be one are left out.
+Weigh = Callable[[Sequence[Part], Sequence[int]], Mapping[tuple[int, int], float]]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,12 +54,12 @@ class Wholes:
     partner: Mapping[int, int]  # what a cloud was found to be
     left: Sequence[int]  # rows of the other scan's clouds that nothing was found to be
     scale: Sequence[float]  # F_s of the other scan's clouds
-    odds: Float[np.ndarray, "w k"]  # log odds of every cloud with every other
+    odds: Mapping[int, float]  # log odds of a cloud with its partner
 
     def in_doubt(self, whole: int) -> bool:
         """Whether a division of the cloud could say what those left are."""
         if whole in self.partner:
-            return len(self.left) > 0 and bool(self.odds[whole, self.partner[whole]] < SURE)
+            return len(self.left) > 0 and self.odds[whole] < SURE
         return len(self.left) > 1
 
     def may_be(self, part: Part) -> list[int]:
@@ -69,7 +70,7 @@ class Wholes:
 
     def gained(self, whole: int) -> float:
         """Log odds that are lost with the whole."""
-        return max(float(self.odds[whole, self.partner[whole]]), 0.0) if whole in self.partner else 0.0
+        return max(self.odds[whole], 0.0) if whole in self.partner else 0.0
 
 
 def chosen(halves: Sequence[tuple[Part, Part]], wholes: Wholes, weigh: Weigh) -> list[Division]:
@@ -87,7 +88,7 @@ def chosen(halves: Sequence[tuple[Part, Part]], wholes: Wholes, weigh: Weigh) ->
             for division in proposals(
                 pair,
                 [
-                    {k: float(odds[row[k], 2 * n + side]) for k in wholes.may_be(p)}
+                    {k: odds.get((row[k], 2 * n + side), NEVER) for k in wholes.may_be(p)}
                     for side, p in enumerate(pair)
                 ],
                 wholes.gained(pair[0].whole),

@@ -83,14 +83,15 @@ def by_evidence(
     frame, weighed = common_frame(prior, old, new, matcher, config.motion, rooms)
     odds = weighed.odds
     there = apply_pose(frame.T_scene_scan, centers(new))
-    moved_m = np.linalg.norm(centers(old)[:, None] - there[None], axis=-1)
+    k, i = odds.pairs.T
+    moved_m = np.linalg.norm(centers(old)[k] - there[i], axis=-1)
     pairs = assign(odds, moved_m, matcher.motion_weight)
     copies = interchangeable(odds, pairs)
-    chance = probability(odds, matcher.search, config.motion)
-    gone, fresh = unmatched(chance, pairs)
+    chance = probability(odds.value, matcher.search, config.motion)
+    gone, fresh = unmatched(odds, chance, pairs)
     found = tuple(
-        Found(object=int(k), instance=int(i), score=float(chance[k, i]), interchangeable=c)
-        for (k, i), c in zip(pairs, copies, strict=True)
+        Found(object=int(k), instance=int(i), score=float(p), interchangeable=c)
+        for (k, i), p, c in zip(pairs, chance[odds.rows_of(pairs)], copies, strict=True)
     )
     return Identified(found=found, gone=gone, new=fresh, frame=frame, aligned=weighed.aligned)
 

@@ -7,6 +7,7 @@ the paper, which takes every scan to be complete.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -32,9 +33,13 @@ def not_looked_at(
     """Ids of those `missing` objects whose last place the scan did not look at; none where it has no background."""
     if len(scan.background) < LEAST_BACKGROUND:
         return ()
+    if not len(missing):
+        return ()
     room = apply_pose(T_scene_scan, np.concatenate([scan.background, *(i.points for i in scan.instances)]))
-    share = looked_at_upright if upright else looked_at
-    return tuple(objects[k].id for k in missing if share(last_place(objects[k]), room) < LOOKED_AT)
+    share = (
+        partial(looked_at_upright, room=Columns(room)) if upright else partial(looked_at, room=KDTree(room))
+    )
+    return tuple(objects[k].id for k in missing if share(last_place(objects[k])) < LOOKED_AT)
 
 
 def last_place(o: SceneObject) -> Points:
@@ -42,20 +47,33 @@ def last_place(o: SceneObject) -> Points:
     return apply_pose(place_of(o.observations[-1]), accumulated_points(o))
 
 
-def looked_at_upright(place: Points, room: Points) -> float:
-    """Share of the columns under a place (z up) that hold points of the scan, none of them over its top."""
-    below = room[room[:, 2] < place[:, 2].max() + ABOVE_M]
-    wanted, seen = (np.unique(_columns(p), axis=0) for p in (place, below))
-    both = np.concatenate([wanted, seen])
-    return (len(both) - len(np.unique(both, axis=0))) / len(wanted)
+def looked_at_upright(place: Points, room: Columns) -> float:
+    """Share of the columns under a place (z up) that hold points of the scan, not all of them over its top."""
+    lowest = room.lowest_m(place)
+    return float((lowest < place[:, 2].max() + ABOVE_M).mean())
+
+
+class Columns:
+    """The lowest point of a scan in every column, z up."""
+
+    def __init__(self, points: Points) -> None:
+        cell = _columns(points)
+        order = np.lexsort((points[:, 2], cell[:, 1], cell[:, 0]))
+        first = order[np.r_[True, (np.diff(cell[order], axis=0) != 0).any(axis=1)]]
+        self._lowest = dict(zip(map(tuple, cell[first].tolist()), points[first, 2].tolist(), strict=True))
+
+    def lowest_m(self, place: Points) -> Float[np.ndarray, " c"]:
+        """Of every column that holds a point of a place, the height of the scan's lowest; infinite without any."""
+        wanted = np.unique(_columns(place), axis=0).tolist()
+        return np.array([self._lowest.get(tuple(c), np.inf) for c in wanted])
 
 
 def _columns(points: Points) -> Int[np.ndarray, "n 2"]:
     return np.floor(points[:, :2] / CELL_M).astype(np.int64)
 
 
-def looked_at(place: Points, room: Points) -> float:
+def looked_at(place: Points, room: KDTree) -> float:
     """Share of a place's points with a point of the scan nearer than its radius."""
     radius = float(np.sqrt(((place - place.mean(axis=0)) ** 2).sum(axis=1).mean()))
-    distance, _ = KDTree(room).query(place, distance_upper_bound=radius)
+    distance, _ = room.query(place, distance_upper_bound=radius)
     return float(np.isfinite(distance).mean())

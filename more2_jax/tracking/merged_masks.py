@@ -9,9 +9,10 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from scipy.spatial import KDTree
 
 from more2_jax.config import EvidenceMatcher, SceneConfig
@@ -131,7 +132,7 @@ class Compared:
     def divisions_of_instances(self, instances: Sequence[Instance]) -> list[Division]:
         """Which instances hold two objects that are known apart."""
         partner = {f.instance: f.object for f in self.identified.found}
-        wholes = wholes_of(partner, self.old, self.odds().T)
+        wholes = wholes_of(partner, self.old, self.odds_of_found(1))
         cuts = {
             i: self.cuts(
                 self.new[i].points,
@@ -162,7 +163,7 @@ class Compared:
     def divisions_of_objects(self, objects: Sequence[SceneObject]) -> list[Division]:
         """Which objects, seen once, are two that the new scan shows apart."""
         partner = {f.object: f.instance for f in self.identified.found}
-        wholes = wholes_of(partner, self.new, self.odds())
+        wholes = wholes_of(partner, self.new, self.odds_of_found(0))
         cuts = {
             k: self.cuts(
                 self.old[k].points,
@@ -184,7 +185,12 @@ class Compared:
         return chosen(
             self.halves(cuts, [(o.points, o.normals) for o in objects]),
             wholes,
-            lambda parts, others: self.odds_of_halves(map(half, parts), [self.new[i] for i in others]).T,
+            lambda parts, others: {
+                (i, part): z
+                for (part, i), z in self.odds_of_halves(
+                    map(half, parts), [self.new[i] for i in others]
+                ).items()
+            },
         )
 
     def cuts(self, points: Points, partner: Points | None) -> list[Cut]:
@@ -203,27 +209,35 @@ class Compared:
 
     def best_pose(self, k: int, i: int) -> Pose:
         """The pose of a pair that fits best: T_scene_scan as if the object had not moved."""
-        row = self.aligned.row_of(k, i)
-        best = evidence_at(self.aligned, self.matcher.search, self.config.motion, self.height_m()).pose
-        return self.aligned.T_old_new[row, best[row]]
+        (row,) = self.aligned.rows_of([(k, i)])
+        return self.aligned.T_old_new[row, self.best[row]]
+
+    @cached_property
+    def best(self) -> Int[np.ndarray, " p"]:
+        """Which of the poses of every aligned pair fits best."""
+        return evidence_at(self.aligned, self.matcher.search, self.config.motion, self.height_m()).pose
 
     def height_m(self) -> float:
         """The common height, upright."""
         return float(self.identified.frame.T_scene_scan[2, 3]) if self.config.motion == "upright" else 0.0
 
-    def odds(self) -> Float[np.ndarray, "n m"]:
-        """Log odds of the wholes."""
-        return odds_of(self.aligned, self.matcher.search, self.config.motion, self.height_m())
+    def odds_of_found(self, side: int) -> dict[int, float]:
+        """Log odds of the pairs found, by their rows of objects (side 0) or of instances (1)."""
+        pairs = [(f.object, f.instance) for f in self.identified.found]
+        odds = odds_of(self.aligned, self.matcher.search, self.config.motion, self.height_m())
+        value = odds.value[self.aligned.rows_of(pairs)]
+        return {pair[side]: float(z) for pair, z in zip(pairs, value, strict=True)}
 
     def odds_of_halves(
         self, old: Iterable[ObservedObject], new: Iterable[ObservedObject]
-    ) -> Float[np.ndarray, "n m"]:
-        """Log odds of halves with what they may be."""
+    ) -> dict[tuple[int, int], float]:
+        """Log odds of halves with what they may be, by rows of `old` and `new`."""
         matcher = dataclasses.replace(self.matcher, candidates=CANDIDATES)
         T = self.identified.frame.T_scene_scan
         sides, seen = (list(old), list(new)), self.aligned.seen
         aligned = align_candidates(self.prior, *sides, matcher, self.config.motion, T, seen)
-        return odds_of(aligned, matcher.search, self.config.motion, self.height_m())
+        odds = odds_of(aligned, matcher.search, self.config.motion, self.height_m())
+        return {(k, i): z for (k, i), z in zip(odds.pairs.tolist(), odds.value.tolist(), strict=True)}
 
     def halves(
         self, cuts: dict[int, list[Cut]], clouds: Sequence[tuple[Points, Normals | None]]
@@ -246,7 +260,7 @@ class Compared:
 
 
 def wholes_of(
-    partner: Mapping[int, int], others: Sequence[ObservedObject], odds: Float[np.ndarray, "w k"]
+    partner: Mapping[int, int], others: Sequence[ObservedObject], odds: Mapping[int, float]
 ) -> Wholes:
     """How the clouds of one scan stand to `others`, those of the other."""
     left = sorted(set(range(len(others))) - set(partner.values()))

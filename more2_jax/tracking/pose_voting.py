@@ -22,6 +22,7 @@ FEWEST = 3  # objects that must agree on another frame than the one given,
 TIMES = 2  # and as many times those that agree with the one given, and one more
 SCALE_M = 0.02  # of the Geman-McClure weights: an object that moved by it counts a quarter
 ROUNDS = 10  # of reweighting
+MOST_TRIED = 1024  # frames that are tried: of a room all; of a building what stayed proposes its frame often
 ARM_M = 0.3  # of the points that stand for an object's turn
 ROOM_REACH_M = 0.1  # a background's point farther from the other background counts as this far
 ROOM_POINTS = 2000
@@ -84,7 +85,8 @@ def most_agreed(votes: Votes, motion: MotionModel, given: Pose) -> Pose:
     ways = votes.T_scene_scan.reshape(-1, 4, 4)
     if len(votes.center) < FEWEST:
         return given
-    best = max(ways, key=lambda T: agreement(T, votes)[1])
+    tried = ways[:: max(1, -(-len(ways) // MOST_TRIED))]
+    best = max(tried, key=lambda T: agreement(T, votes)[1])
     best = estimate(best, votes, motion).T_scene_scan
     count, before = agreement(best, votes)[0], agreement(given, votes)[0]
     return best if count >= max(FEWEST, TIMES * before + 1) else given

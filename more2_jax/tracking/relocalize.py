@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 import jax
 import numpy as np
+from jaxtyping import Float
 
 from more2_jax.config import EvidenceMatcher, SceneConfig
 from more2_jax.geometry.poses import Points, Pose, local_poses
@@ -18,6 +19,8 @@ from more2_jax.tracking.identify import Found, Identified
 from more2_jax.tracking.objects import accumulated_normals, accumulated_points, observation_in, place_of
 from more2_jax.tracking.scan_frame import settled_frame
 from more2_jax.types import Frame, Instance, Observation, ObservedObject, Registration, SceneObject, Sight
+
+PAIR_MB = 2  # of a pair ready to be registered: both clouds, codes, and what sensors saw (1.2 MB)
 
 
 def known_object(
@@ -45,10 +48,13 @@ def known_object(
 
 
 def pairs_found(
-    identified: Identified, old: Sequence[ObservedObject], new: Sequence[ObservedObject]
+    identified: Identified,
+    old: Sequence[ObservedObject],
+    new: Sequence[ObservedObject],
+    found: Sequence[Found] | None = None,
 ) -> PairBatch:
-    """The pairs of a scan to register, with the poses that matching found of them."""
-    found, T = identified.found, identified.frame.T_scene_scan
+    """The pairs of a scan to register, with the poses that matching found of them; of those `found`, by default all."""
+    found, T = identified.found if found is None else found, identified.frame.T_scene_scan
     if identified.aligned is not None:
         pairs = identified.aligned.take([(f.object, f.instance) for f in found])
         return with_frame(pairs, T)
@@ -82,14 +88,11 @@ def relocalize(
     found, frame = identified.found, identified.frame
     if not found:
         return [], frame
-    pairs = pairs_found(identified, [o for o, _ in old], new)
-    result = jax.device_get(register(prior, pairs, config.registration, config.motion))
+    result, T_scene_scan = registered(prior, identified, old, new, config, frame)
     if isinstance(config.matching, EvidenceMatcher):
-        frame = settled(objects, old, found, pairs, result, frame, new, config)
+        frame = settled(objects, old, found, T_scene_scan, result, frame, new, config)
         if not np.array_equal(frame.T_scene_scan, identified.frame.T_scene_scan):
-            pairs = with_frame(pairs, frame.T_scene_scan)
-            result = jax.device_get(register(prior, pairs, config.registration, config.motion))
-    T_scene_scan = pairs.to_world(result.T_target_source)
+            result, T_scene_scan = registered(prior, identified, old, new, config, frame)
     return [
         observation(
             result, n, old[f.object][1] @ T_scene_scan[n], f, scan, instances[f.instance].id, frame, config
@@ -98,21 +101,43 @@ def relocalize(
     ], frame
 
 
+def registered(
+    prior: Prior,
+    identified: Identified,
+    old: Sequence[tuple[ObservedObject, Pose]],
+    new: Sequence[ObservedObject],
+    config: SceneConfig,
+    frame: Frame,
+) -> tuple[Registration, Float[np.ndarray, "p 4 4"]]:
+    """All that was found registered, `frame` being the scan's; and the poses of instances in the scene's frame.
+
+    In batches of as many pairs as `config.memory_mb` holds.
+    """
+    known, found, parts = [o for o, _ in old], identified.found, list[tuple[Registration, np.ndarray]]()
+    at_once = max(1, config.memory_mb // PAIR_MB)
+    for start in range(0, len(found), at_once):
+        pairs = pairs_found(identified, known, new, found[start : start + at_once])
+        if frame is not identified.frame:
+            pairs = with_frame(pairs, frame.T_scene_scan)
+        result = jax.device_get(register(prior, pairs, config.registration, config.motion))
+        parts.append((result, pairs.to_world(result.T_target_source)))
+    return parts[0] if len(parts) == 1 else jax.tree.map(lambda *x: np.concatenate(x), *parts)
+
+
 def settled(
     objects: Sequence[SceneObject],
     old: Sequence[tuple[ObservedObject, Pose]],
     found: Sequence[Found],
-    pairs: PairBatch,
+    T_scene_new: Float[np.ndarray, "p 4 4"],
     result: Registration,
     frame: Frame,
     new: Sequence[ObservedObject],
     config: SceneConfig,
 ) -> Frame:
     """The frame by the registered pairs: what stayed since it was last seen says where the scan lies."""
-    poses = pairs.to_world(result.T_target_source)
     T_scene_scan = [
         place_of(objects[f.object].observations[-1]) @ old[f.object][1] @ T
-        for f, T in zip(found, poses, strict=True)
+        for f, T in zip(found, T_scene_new, strict=True)
     ]
     centers = np.stack([new[f.instance].points.mean(axis=0) for f in found])
     sigma_m = [position_sigma(result, n) for n in range(len(found))]

@@ -13,6 +13,7 @@ import numpy as np
 from more2_jax.config import EvidenceMatcher, MotionModel
 from more2_jax.geometry.poses import Points, Pose, apply_pose, vertical_shift
 from more2_jax.matching.candidates import align_candidates, odds_of
+from more2_jax.matching.proposals import is_building, signatures
 from more2_jax.network.prior import Prior
 from more2_jax.tracking.pose_voting import (
     FEWEST,
@@ -30,6 +31,7 @@ from more2_jax.types import Frame, ObservedObject
 GIVEN_M = 0.01  # by more than this a frame as given is off where another takes its place,
 MUCH_LESS = 0.5  # which leaves at most this share of what the given one leaves of the votes,
 SURE = 2.0  # and by more than this many standard errors
+ELSEWHERE_M = 3.0  # a building's frame that is off by more hides partners that are sought near by
 
 
 def common_frame(
@@ -47,16 +49,39 @@ def common_frame(
         aligned = align_candidates(prior, old, new, matcher, motion)
         weighed = Weighed(height_m=0.0, aligned=aligned, odds=odds_of(aligned, matcher.search, motion))
     lifted = vertical_shift(weighed.height_m)
-    pairs = np.argwhere(weighed.odds > 0)
+    likely = weighed.odds.value > 0
+    pairs = weighed.odds.pairs[likely]
     votes = Votes(
-        T_scene_scan=weighed.aligned.T_old_new[[weighed.aligned.row_of(k, i) for k, i in pairs.tolist()]],
+        T_scene_scan=weighed.aligned.T_old_new[likely],
         center=np.stack([o.points.mean(axis=0) for o in new])[pairs[:, 1]],
         object=pairs[:, 0],
         instance=pairs[:, 1],
     )
     T = most_agreed(votes, motion, lifted)
     misfit, before = (room_misfit(x, rooms.scene, rooms.scan) for x in (T, lifted))
-    return Frame(T_scene_scan=T if misfit <= ROOM_WORSE * before else lifted), weighed
+    if misfit > ROOM_WORSE * before:
+        return Frame(T_scene_scan=lifted), weighed
+    if is_building(signatures(old), signatures(new)) and shift_m(T, lifted, votes.center) > ELSEWHERE_M:
+        weighed = sought_there(prior, weighed, matcher, motion, T)
+    return Frame(T_scene_scan=T), weighed
+
+
+def shift_m(T: Pose, other: Pose, points: Points) -> float:
+    """How far apart two frames put the same points, in the median; 0 of none."""
+    apart = np.linalg.norm(apply_pose(T, points) - apply_pose(other, points), axis=1)
+    return float(np.median(apart)) if len(apart) else 0.0
+
+
+def sought_there(
+    prior: Prior, weighed: Weighed, matcher: EvidenceMatcher, motion: MotionModel, T_scene_scan: Pose
+) -> Weighed:
+    """The pairs of a building anew, partners being sought where its frame has them, which was not known before."""
+    new, old = weighed.aligned.sides
+    lift = vertical_shift(weighed.aligned.height_m)
+    seen = weighed.aligned.seen
+    aligned = align_candidates(prior, old, new, matcher, motion, lift, seen, place=T_scene_scan)
+    odds = odds_of(aligned, matcher.search, motion, weighed.height_m)
+    return Weighed(height_m=weighed.height_m, aligned=aligned, odds=odds)
 
 
 def settled_frame(

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from more2_jax.config import EvidenceMatcher
 from more2_jax.geometry.floor import floor_height
@@ -15,17 +16,19 @@ from more2_jax.matching.assignment import LogOdds, assign
 from more2_jax.matching.candidates import (
     AlignedPairs,
     align_candidates,
-    compared,
     evidence_at,
     heights,
     odds_of,
-    proposal_of,
 )
 from more2_jax.matching.metric_evidence import seen_in
+from more2_jax.matching.proposals import likeliest, signatures
 from more2_jax.network.prior import Prior
 from more2_jax.types import ObservedObject
 
 SPREAD_M = 0.015  # of the votes for a height
+VOTERS = 32  # partners of an object that vote: the next has 2⁻³² of the first one's weight
+HEIGHTS = 2048  # at which votes are counted; of rooms with 32 objects and fewer all
+VOTES_AT_ONCE = 1 << 22  # differences of heights in memory: 32 MB
 AS_GOOD_VOTES = 0.8  # share of the most votes at which heights that agree are not doubted
 CLEARLY = 3.0  # of log odds over a scene: what a change of height must explain beyond none at all
 LEAST_M = 0.005  # a smaller lift is none
@@ -51,16 +54,20 @@ class Weighed:
     aligned: AlignedPairs
     odds: LogOdds
 
+    @cached_property
+    def assigned(self) -> Int[np.ndarray, "q 2"]:
+        """The likeliest assignment, wherever things moved."""
+        return assign(self.odds, np.zeros(len(self.odds.value)), 0.0)
+
     @property
     def explained(self) -> float:
         """Log odds of the likeliest assignment against no pair at all."""
-        pairs = assign(self.odds, np.zeros(self.odds.shape), 0.0)
-        return float(self.odds[tuple(pairs.T)].sum())
+        return float(self.odds.value[self.odds.rows_of(self.assigned)].sum())
 
     @property
     def matched(self) -> int:
         """How many pairs that assignment has."""
-        return len(assign(self.odds, np.zeros(self.odds.shape), 0.0))
+        return len(self.assigned)
 
     def overrules(self, expected: Weighed) -> bool:
         """Whether this height is believed against the one expected: it explains clearly more, and loses no pair."""
@@ -118,10 +125,9 @@ def weighed_at(aligned: AlignedPairs, matcher: EvidenceMatcher, height_m: float)
 def settled_height(aligned: AlignedPairs, matcher: EvidenceMatcher, height_m: float) -> Weighed:
     """A height corrected by the pairs that it makes fit, where that explains more."""
     first = weighed_at(aligned, matcher, height_m)
-    pairs = assign(first.odds, np.zeros(first.odds.shape), 0.0)
-    if len(pairs) < 2:
+    rows = first.odds.rows_of(first.assigned)
+    if len(rows) < 2:
         return first
-    rows = [aligned.row_of(k, i) for k, i in pairs.tolist()]
     best = evidence_at(aligned, matcher.search, "upright", height_m).pose[rows]
     corrected_m = float(np.median(aligned.T_old_new[rows, best, 2, 3]))
     if not LEAST_M < abs(corrected_m - height_m) < OUT_OF_REACH_M:
@@ -133,29 +139,40 @@ def settled_height(aligned: AlignedPairs, matcher: EvidenceMatcher, height_m: fl
 def height_votes(
     old: Sequence[ObservedObject], new: Sequence[ObservedObject], matcher: EvidenceMatcher
 ) -> tuple[Float[np.ndarray, " v"], Float[np.ndarray, " v"]]:
-    """Differences of the bottoms and of the tops of likely pairs, meters, and their weights."""
-    proposal = proposal_of(compared(old, new), matcher)
-    ranks = [np.argsort(np.argsort(-proposal, axis=a), axis=a) for a in (0, 1)]
-    weight = sum(0.5**r for r in ranks)
-    differences = [a[:, None] - b for a, b in zip(heights(old), heights(new), strict=True)]
-    return np.concatenate([d.ravel() for d in differences]), np.tile(np.ravel(weight), len(differences))
+    """Differences of the bottoms and of the tops of likely pairs, meters, and their weights.
+
+    A partner has half the weight of one that is likelier; from the `VOTERS`-th on none.
+    """
+    likely = likeliest(signatures(old), signatures(new), VOTERS, matcher.size_weight)
+    k, i = likely.pairs.T
+    weight = 0.5 ** likely.rank[:, 1] + 0.5 ** likely.rank[:, 0]
+    differences = [a[k] - b[i] for a, b in zip(heights(old), heights(new), strict=True)]
+    return np.concatenate(differences), np.tile(weight, len(differences))
+
+
+def few(votes: Float[np.ndarray, " v"]) -> Float[np.ndarray, " k"]:
+    """Some of the heights that have votes, `HEIGHTS` at most: a building has more pairs than heights."""
+    return votes[:: max(1, -(-len(votes) // HEIGHTS))]
 
 
 def support(
     at: Float[np.ndarray, " k"], votes: Float[np.ndarray, " v"], weights: Float[np.ndarray, " v"]
 ) -> Float[np.ndarray, " k"]:
-    """Votes for every height, each spread by `SPREAD_M`."""
-    return np.exp(-0.5 * ((at[:, None] - votes) / SPREAD_M) ** 2) @ weights
+    """Votes for every height, each spread by `SPREAD_M`; some heights at a time."""
+    step = max(1, VOTES_AT_ONCE // len(votes))
+    blocks = [at[start : start + step] for start in range(0, len(at), step)]
+    return np.concatenate([np.exp(-0.5 * ((x[:, None] - votes) / SPREAD_M) ** 2) @ weights for x in blocks])
 
 
 def best_vote(votes: Float[np.ndarray, " v"], weights: Float[np.ndarray, " v"]) -> float:
     """The height with most votes: the mean of those about it."""
-    middle = votes[np.argmax(support(votes, votes, weights))]
+    tried = few(votes)
+    middle = tried[np.argmax(support(tried, votes, weights))]
     near = weights * np.exp(-0.5 * ((votes - middle) / SPREAD_M) ** 2)
     return float(near @ votes / near.sum())
 
 
 def doubtful(votes: Float[np.ndarray, " v"], weights: Float[np.ndarray, " v"]) -> bool:
     """Whether another height has clearly more votes than none."""
-    most = support(votes, votes, weights).max()
+    most = support(few(votes), votes, weights).max()
     return bool(support(np.zeros(1), votes, weights)[0] < AS_GOOD_VOTES * most)

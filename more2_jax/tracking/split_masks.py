@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Float
 from scipy.spatial import KDTree
 
 from more2_jax.geometry.poses import Points, Pose, apply_pose
@@ -94,12 +95,13 @@ def parts_in_scan(
 ) -> Parts:
     """Instances left over that are parts of objects found by another one."""
     left = sorted(set(range(len(instances))) - {i for _, i in found})
+    balls = Balls.around([instances[i].points for i in left])
     parts: Parts = {}
     for n, ((k, _), pose) in enumerate(zip(found, seen, strict=True)):
         if not trusted(pose):
             continue
         whole = accumulated_points(objects[k])
-        for i in left:
+        for i in (left[r] for r in balls.reach(whole, pose.T_ref_scan)):
             share = share_on(whole, apply_pose(pose.T_ref_scan, instances[i].points))
             if share >= max(LEAST_ON, parts.get(i, (0, 0.0))[1]):
                 parts[i] = n, share
@@ -117,18 +119,45 @@ def parts_known(
     Only those that were seen when the other was, and once: two parts of one mask.
     """
     left = sorted(set(range(len(objects))) - {k for k, _ in found})
+    balls = Balls.around([there(objects[q]) for q in left])
     parts: Parts = {}
     for n, ((k, i), pose) in enumerate(zip(found, seen, strict=True)):
         last = objects[k].observations[-1]
         if not trusted(pose):
             continue
         whole = apply_pose(place_of(last) @ pose.T_ref_scan, instances[i].points)
-        for q in (q for q in left if [s.scan for s in objects[q].observations] == [last.scan]):
-            there = apply_pose(place_of(objects[q].observations[0]), objects[q].points)
-            share = share_on(whole, there)
+        near = (left[r] for r in balls.reach(whole))
+        for q in (q for q in near if [s.scan for s in objects[q].observations] == [last.scan]):
+            share = share_on(whole, there(objects[q]))
             if share >= max(LEAST_ON, parts.get(q, (0, 0.0))[1]):
                 parts[q] = n, share
     return parts
+
+
+def there(o: SceneObject) -> Points:
+    """An object where it was seen first, in the scene's frame."""
+    return apply_pose(place_of(o.observations[0]), o.points)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Balls:
+    """Balls that hold clouds: most clouds of a building are told by them to lie nowhere near another."""
+
+    center: Points
+    radius_m: Float[np.ndarray, " n"]
+
+    @classmethod
+    def around(cls, clouds: Sequence[Points]) -> Balls:
+        """One about each cloud."""
+        center = np.array([c.mean(axis=0) for c in clouds]).reshape(-1, 3)
+        radius = [np.linalg.norm(c - middle, axis=1).max() for c, middle in zip(clouds, center, strict=True)]
+        return cls(center=center, radius_m=np.array(radius))
+
+    def reach(self, whole: Points, T_whole_clouds: Pose | None = None) -> list[int]:
+        """Which of the clouds may have points on a whole: their balls come so near the box about it."""
+        center = self.center if T_whole_clouds is None else apply_pose(T_whole_clouds, self.center)
+        beyond = np.maximum(np.maximum(whole.min(axis=0) - center, center - whole.max(axis=0)), 0.0)
+        return np.flatnonzero(np.linalg.norm(beyond, axis=1) <= self.radius_m + reach_m(whole)).tolist()
 
 
 def trusted(pose: Observation) -> bool:

@@ -135,7 +135,7 @@ def test_pairs_are_weighed_as_the_package_weighs_them(tiny_prior):
     for b, pair in enumerate(found, 1):
         aligned = align_candidates(tiny_prior, sides[0], sides[b], matcher, "upright")
         odds = odds_of(aligned, search, "upright")
-        np.testing.assert_allclose(pair.odds(UPRIGHT), odds, rtol=1e-3, atol=1e-3)
+        np.testing.assert_allclose(pair.odds(UPRIGHT), odds.matrix(), rtol=1e-3, atol=1e-3)
 
 
 def test_curves_are_of_every_candidate_by_weights_that_did_not_see_its_room():

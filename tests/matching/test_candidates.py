@@ -8,12 +8,21 @@ import jaxlie
 import numpy as np
 import pytest
 from compiling import quick_jit
+from scipy.optimize import linear_sum_assignment
 from scipy.special import expit
 
 from more2_jax.config import EvidenceMatcher, SurfaceSearch, preset
 from more2_jax.geometry.point_to_plane import coarsened, whole_surface
 from more2_jax.geometry.poses import vertical_shift
-from more2_jax.matching.assignment import NEVER, assign, interchangeable, unmatched
+from more2_jax.matching.assignment import (
+    FARTHEST_M,
+    LEAST_GAIN,
+    NEVER,
+    LogOdds,
+    assign,
+    interchangeable,
+    unmatched,
+)
 from more2_jax.matching.calibration import (
     FREE,
     HIGHEST_M,
@@ -26,7 +35,7 @@ from more2_jax.matching.calibration import (
     calibrated,
     log_odds,
 )
-from more2_jax.matching.candidates import align_candidates, evidence_at, odds_of, proposed
+from more2_jax.matching.candidates import align_candidates, evidence_at, odds_of
 from more2_jax.matching.pair_evidence import PairEvidence
 from more2_jax.network.embedding_batch import embed
 from more2_jax.network.prior import load_prior
@@ -48,28 +57,48 @@ def box(rng, size, count=600):
     return points * size + [0, 0, size[2] / 2]
 
 
+def assigned(matrix, moved_m=0.0, weight=0.0):
+    """The assignment of a matrix of log odds, every pair moved by so many meters."""
+    odds = LogOdds.of(np.asarray(matrix))
+    return assign(odds, np.broadcast_to(moved_m, odds.shape)[tuple(odds.pairs.T)], weight)
+
+
 def test_only_what_is_likelier_one_than_two_is_matched():
     odds = np.array([[2.0, 1.0], [3.0, -0.5], [-1.0, -2.0]])
-    assert assign(odds, np.zeros((3, 2)), 0.0).tolist() == [[0, 1], [1, 0]]
-    assert assign(-np.abs(odds), np.zeros((3, 2)), 0.0).tolist() == []
-    assert assign(np.full((2, 2), NEVER), np.zeros((2, 2)), 1.0).tolist() == []
+    assert assigned(odds).tolist() == [[0, 1], [1, 0]]
+    assert assigned(-np.abs(odds)).tolist() == []
+    assert assigned(np.full((2, 2), NEVER), weight=1.0).tolist() == []
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_sparse_assignment_is_that_of_the_whole_matrix(seed):
+    """Pairs of separate rooms, and of all of them together: SciPy's assignment of the whole matrix is the oracle."""
+    rng = np.random.default_rng(seed)
+    odds = rng.normal(1.0, 3.0, (30, 40))
+    odds[rng.random(odds.shape) > (0.05, 0.1, 0.5, 1.0)[seed]] = NEVER
+    odds, moved = odds[rng.permutation(30)], rng.uniform(0, 20, odds.shape)
+    gain = np.where(odds > 0, np.maximum(odds - 0.2 * np.minimum(moved, FARTHEST_M), LEAST_GAIN * odds), 0.0)
+    rows = np.stack(linear_sum_assignment(-gain), axis=1)
+    expected = rows[gain[tuple(rows.T)] > 0]
+    assert len(expected) > 5
+    assert assigned(odds, moved, 0.2).tolist() == expected.tolist()
 
 
 def test_of_identical_copies_each_stays_as_near_as_can_be_and_is_flagged():
     odds = np.array([[3.0, 3.1, -4], [3.1, 3.0, -4], [-4, -4, 3.0]])
     moved = np.array([[0.0, 3.0, 9], [3.0, 0.0, 9], [9, 9, 0.0]])
-    pairs = assign(odds, moved, 0.2)
+    pairs = assigned(odds, moved, 0.2)
     assert pairs.tolist() == [[0, 0], [1, 1], [2, 2]]
-    assert assign(odds, moved, 0.0).tolist() == [[0, 1], [1, 0], [2, 2]]
-    assert interchangeable(odds, pairs) == [True, True, False]
+    assert assigned(odds, moved, 0.0).tolist() == [[0, 1], [1, 0], [2, 2]]
+    assert interchangeable(LogOdds.of(odds), pairs) == [True, True, False]
 
 
 def test_a_copy_that_went_makes_the_other_interchangeable_and_far_motion_alone_rejects_none():
     odds = np.array([[3.0, -4], [2.9, -4]])
-    pairs = assign(odds, np.array([[1.0, 5], [100.0, 5]]), 0.2)
+    pairs = assigned(odds, np.array([[1.0, 5], [100.0, 5]]), 0.2)
     assert pairs.tolist() == [[0, 0]]
-    assert interchangeable(odds, pairs) == [True]
-    assert assign(np.array([[0.5]]), np.array([[100.0]]), 0.2).tolist() == [[0, 0]]
+    assert interchangeable(LogOdds.of(odds), pairs) == [True]
+    assert assigned([[0.5]], 100.0, 0.2).tolist() == [[0, 0]]
 
 
 def test_log_odds_are_linear_and_the_two_ways_have_no_order():
@@ -131,9 +160,10 @@ def test_in_any_orientation_the_evidence_is_that_of_the_best_pose(tiny_prior):
     search = SurfaceSearch(steps=4, dense=256, cells=8)
     aligned = align_candidates(tiny_prior, old, new, EvidenceMatcher(search=search), "free")
     found = evidence_at(aligned, search, "free")
+    pair = aligned.take([(0, 0)])
     sides = [
         jax.tree.map(lambda x: jnp.asarray(x[0]), dataclasses.replace(side, origin=None))
-        for side in (aligned.pairs.source, aligned.pairs.target)
+        for side in (pair.source, pair.target)
     ]
     sample = quick_jit(lambda p, m: coarsened(whole_surface(p, m), 128, 256, 8).sampled)
     sampled = [sample(x.cloud.points, x.cloud.mask) for x in sides]
@@ -153,19 +183,10 @@ def test_in_any_orientation_the_evidence_is_that_of_the_best_pose(tiny_prior):
 
 def test_what_is_left_over_is_gone_unless_another_left_over_may_be_it():
     odds = np.array([[2.0, -1.0, -2.0], [-3.0, -1.0, NEVER]])
-    gone, new = unmatched(expit(odds), np.array([[0, 0]]))
+    listed = LogOdds.of(odds)
+    gone, new = unmatched(listed, expit(listed.value), np.array([[0, 0]]))
     assert gone == {1: pytest.approx(1 - expit(-1.0))}
     assert new == {1: pytest.approx(1 - expit(-1.0)), 2: pytest.approx(1.0)}
-
-
-def test_every_row_and_column_proposes_its_best():
-    score = np.random.default_rng(0).normal(size=(6, 9))
-    chosen = proposed(score, 2)
-    for matrix, picked in ((score, chosen), (score.T, chosen.T)):
-        for row, mine in zip(matrix, picked, strict=True):
-            assert mine[np.argsort(-row)[:2]].all()
-    assert chosen.sum() < score.size
-    assert proposed(score, 0).all()
 
 
 def test_geometry_tells_boxes_of_one_size_but_different_shape_apart(tiny_prior):
@@ -176,7 +197,7 @@ def test_geometry_tells_boxes_of_one_size_but_different_shape_apart(tiny_prior):
     known = [observed(tiny_prior, clouds) for clouds in (first, second)]
     matcher = preset("robust").matching
     aligned = align_candidates(tiny_prior, known[0], known[1], matcher, "upright")
-    odds = odds_of(aligned, matcher.search, "upright")
+    odds = odds_of(aligned, matcher.search, "upright").matrix()
     assert odds.shape == (2, 2)
     assert min(odds[0, 1], odds[1, 0]) > max(odds[0, 0], odds[1, 1]) + 1
 
@@ -207,24 +228,25 @@ def test_a_height_weighed_afterwards_is_that_height_searched_at(tiny_prior, lift
     matcher = preset("robust").matching
     below = align_candidates(tiny_prior, *lifted_room, matcher, "upright")
     there = align_candidates(tiny_prior, *lifted_room, matcher, "upright", vertical_shift(height_m))
-    weighed = odds_of(below, matcher.search, "upright", height_m)
-    searched = odds_of(there, matcher.search, "upright", height_m)
+    weighed = odds_of(below, matcher.search, "upright", height_m).matrix()
+    searched = odds_of(there, matcher.search, "upright", height_m).matrix()
     np.testing.assert_array_equal(weighed > 0, searched > 0)
     # Boxes of different sizes fit in several poses about as badly: which of these is best may differ.
     np.testing.assert_allclose(np.diag(weighed), np.diag(searched), atol=0.3)
-    assert np.abs(weighed - odds_of(below, matcher.search, "upright", 0.0)).max() > 0.3
+    assert np.abs(weighed - odds_of(below, matcher.search, "upright", 0.0).matrix()).max() > 0.3
 
 
 def test_pairs_are_listed_row_by_row_and_taken_with_the_poses_found(tiny_prior, lifted_room):
     old, new = lifted_room
     matcher = EvidenceMatcher(candidates=1)
     aligned = align_candidates(tiny_prior, old, new, matcher, "upright")
-    listed = [tuple(pair) for pair in np.argwhere(aligned.among).tolist()]
-    assert [aligned.row_of(k, i) for k, i in listed] == list(range(len(listed)))
+    listed = [tuple(pair) for pair in aligned.rows.tolist()]
+    assert listed == sorted(set(listed))
+    assert aligned.rows_of(listed).tolist() == list(range(len(listed)))
     chosen = listed[::-1]
     taken = aligned.take(chosen)
     origins = [[o.points.mean(axis=0) for o in side] for side in (new, old)]
     np.testing.assert_allclose(taken.source.origin, [origins[0][i] for _, i in chosen], atol=1e-9)
     np.testing.assert_allclose(taken.target.origin, [origins[1][k] for k, _ in chosen], atol=1e-9)
     np.testing.assert_allclose(taken.to_world(taken.candidates), aligned.T_old_new[::-1], atol=1e-9)
-    np.testing.assert_array_equal(taken.prepared[0].radius, aligned.objects[0].radius[::-1])
+    np.testing.assert_array_equal(taken.prepared[0].radius, aligned.ready[0].radius[aligned.rows[::-1, 1]])

@@ -11,7 +11,7 @@ from more2_jax.config import EvidenceMatcher, SurfaceSearch
 from more2_jax.geometry.poses import apply_pose
 from more2_jax.matching.calibration import UPRIGHT
 from more2_jax.matching.candidates import align_candidates, evidence_at, odds_of
-from more2_jax.matching.metric_evidence import APART_M, metric_evidence, seen_in
+from more2_jax.matching.metric_evidence import APART_M, metric_evidence, samples_of, seen_in
 from more2_jax.network.embedding_batch import embed
 from more2_jax.registration.pair_batch import local_batch
 from more2_jax.registration.search import alignable
@@ -55,7 +55,8 @@ def compare(scans, pairs, poses, seen):
     old, new = scans
     batches = local_batch(new), local_batch(old)
     ready = tuple(alignable(b, SEARCH) for b in batches)
-    return metric_evidence((new, old), batches, ready, np.array(pairs), np.array(poses), seen), batches, ready
+    samples = tuple(samples_of(r, b.origin) for r, b in zip(ready, batches, strict=True))
+    return metric_evidence((new, old), samples, np.array(pairs), np.array(poses), seen), batches, ready
 
 
 def test_by_definition_of_every_pair_and_pose(scans):
@@ -121,14 +122,13 @@ def test_empty_space_lowers_the_odds_and_is_asked_upright_alone(tiny_prior, scan
         align_candidates(tiny_prior, old, new, matcher, "upright", None, seen_in(old, new, room, room))
         for room in (floor(), np.zeros((0, 3)))
     )
-    more, less = (odds_of(x, SEARCH, "upright") for x in (without, with_room))
-    among = with_room.among
+    more, less = (odds_of(x, SEARCH, "upright").value for x in (without, with_room))
     told, untold = (evidence_at(x, SEARCH, "upright").contradicted for x in (with_room, without))
     shares = told - untold
     assert (shares >= 0).all() and shares.max() > 0.05
-    np.testing.assert_allclose((less - more)[among], UPRIGHT.contradicted * shares, atol=1e-6)
+    np.testing.assert_allclose(less - more, UPRIGHT.contradicted * shares, atol=1e-6)
     free = align_candidates(
         tiny_prior, old, new, EvidenceMatcher(search=dataclasses.replace(SEARCH, field_weight=0.0)), "free"
     )
     assert free.seen is None and not free.metric.contradicted.any() and free.metric.apart.any()
-    assert jnp.isfinite(odds_of(free, SEARCH, "free")).all()
+    assert jnp.isfinite(odds_of(free, SEARCH, "free").value).all()

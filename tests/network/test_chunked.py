@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from more2_jax.network.row_map import chunked
+from more2_jax.network.row_map import chunked, chunked_at
 
 SIZE = 4
 
@@ -33,6 +33,21 @@ def test_any_number_of_rows_gives_what_one_row_at_a_time_gives(program, count):
         for name, value in expected.items():
             np.testing.assert_allclose(found[name][k], value, rtol=1e-6)
     assert all(isinstance(x, np.ndarray) and len(x) == count for x in jax.tree.leaves(found))
+
+
+def test_rows_made_call_by_call_are_those_made_at_once(program):
+    """Of objects that are part of many pairs no more are held than a call takes."""
+    rows, asked = rows_of(5), []
+    pairs = np.random.default_rng(1).integers(0, 5, 11)
+
+    def taken(at):
+        asked.append(len(at))
+        return {k: v[pairs[at]] for k, v in rows.items()}
+
+    found = chunked_at(program, SIZE, len(pairs), taken)
+    for name, value in chunked(program, SIZE, {k: v[pairs] for k, v in rows.items()}).items():
+        np.testing.assert_array_equal(found[name], value)
+    assert asked == [SIZE] * 3
 
 
 def test_of_no_rows_there_is_nothing_in_the_shapes_of_one():

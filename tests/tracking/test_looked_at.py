@@ -4,11 +4,12 @@ import dataclasses
 
 import numpy as np
 import pytest
+from scipy.spatial import KDTree
 
 from more2_jax.config import preset
 from more2_jax.geometry.poses import apply_pose
 from more2_jax.tracking.changes import changes_between, last_known, not_seen_in
-from more2_jax.tracking.looked_at import LOOKED_AT, looked_at, looked_at_upright, not_looked_at
+from more2_jax.tracking.looked_at import LOOKED_AT, Columns, looked_at, looked_at_upright, not_looked_at
 from more2_jax.tracking.objects import new_object, seen_again
 from more2_jax.types import Embedding, Frame, Instance, Observation, Scan, ScanRecord
 
@@ -90,8 +91,9 @@ def test_the_last_place_is_looked_for_not_the_first():
 
 def test_shares_are_of_the_place():
     whole = floor([0, 0], [4, 3])
-    assert looked_at_upright(BOX, whole) == 1.0 == looked_at(BOX, BOX + 0.01)
-    assert looked_at_upright(BOX, whole + [50, 0, 0]) == 0.0 == looked_at(BOX, whole + [50, 0, 0])
+    assert looked_at_upright(BOX, Columns(whole)) == 1.0 == looked_at(BOX, KDTree(BOX + 0.01))
+    away = whole + [50, 0, 0]
+    assert looked_at_upright(BOX, Columns(away)) == 0.0 == looked_at(BOX, KDTree(away))
 
 
 def test_an_object_not_looked_for_is_compared_with_the_scan_that_saw_it_last():

@@ -42,9 +42,9 @@ def decided(odds, *, partner=None, now=0.0, narrow=False, scale=(1.0, 1.0, 1.0))
         partner=partner,
         left=[k for k in range(len(odds)) if k not in partner.values()],
         scale=scale[: len(odds)],
-        odds=np.full((1, len(odds)), now),
+        odds={0: now},
     )
-    return chosen([pair(narrow=narrow)], wholes, lambda _, others: odds[others])
+    return chosen([pair(narrow=narrow)], wholes, lambda _, others: dict(np.ndenumerate(odds[others])))
 
 
 @pytest.mark.parametrize(
@@ -56,7 +56,7 @@ def test_only_a_mask_whose_halves_could_be_what_is_missing_is_cut(partner, left,
         partner={} if partner is None else {0: partner},
         left=range(1, 1 + left),
         scale=[1.0] * 3,
-        odds=np.full((1, 3), now),
+        odds={0: now},
     )
     assert wholes.in_doubt(0) == doubt
 

@@ -31,7 +31,7 @@ def searched(monkeypatch):
         original = module.search_poses
 
         def search_poses(source, target, stayed, *settings):
-            asked.append((name, len(source.radius)))
+            asked.append((name, len(stayed.wxyz_xyz)))
             return original(source, target, stayed, *settings)
 
         monkeypatch.setattr(module, "search_poses", search_poses)
@@ -68,11 +68,9 @@ def test_every_candidate_pair_is_searched_once_and_registration_searches_nothing
     codes = embed(tiny_prior, [i.points for i in second.instances])
     old, new = compared_objects(first, second.instances, codes, second, config)
     known = [o for o, _ in old]
-    among = candidates.proposed(
-        candidates.proposal_of(candidates.compared(known, new), config.matching), config.matching.candidates
-    )
+    worth = candidates.proposed(known, new, config.matching)
     made = add_scan(tiny_prior, first, second, config)
-    assert searched == [("matching", int(among.sum()))]
+    assert searched == [("matching", len(worth.pairs))]
     found = sum(len(o.observations) == 2 for o in made.objects)
     assert found > 0 and refined == [(found, config.matching.search.keep)]
 
@@ -87,6 +85,19 @@ def test_a_scan_whose_frame_settles_elsewhere_is_refined_again_but_not_searched(
     np.testing.assert_array_equal(made.scans[1].frame.T_scene_scan, T)
     assert [name for name, _ in searched] == ["matching"]
     assert refined == [(3, CONFIG.matching.search.keep)] * 2
+
+
+def test_pairs_registered_one_by_one_have_the_poses_they_have_together(tiny_prior, first, refined):
+    second = scan("b", THEN)
+    whole = add_scan(tiny_prior, first, second, CONFIG)
+    assert refined == [(3, CONFIG.matching.search.keep)]
+    refined.clear()
+    few = dataclasses.replace(CONFIG, memory_mb=relocalize.PAIR_MB)
+    apart = add_scan(tiny_prior, first, second, few)
+    assert refined == [(1, CONFIG.matching.search.keep)] * 3
+    for o, p in zip(whole.objects, apart.objects, strict=True):
+        np.testing.assert_array_equal(o.observations[-1].T_ref_scan, p.observations[-1].T_ref_scan)
+        assert o.observations[-1].sigma_m == p.observations[-1].sigma_m
 
 
 def test_another_frame_changes_what_staying_means_and_nothing_else(tiny_prior, first):

@@ -11,6 +11,7 @@ from small_scenes import CONFIG, in_frame, piece, room, scan
 
 from more2_jax.geometry.floor import floor_height
 from more2_jax.geometry.poses import vertical_shift
+from more2_jax.matching.assignment import LogOdds
 from more2_jax.matching.candidates import AlignedPairs
 from more2_jax.network.embedding_batch import embed
 from more2_jax.scene import add_scan, start_scene
@@ -109,7 +110,7 @@ def test_floors_propose_a_height_where_the_objects_do_not_agree(tiny_prior):
     rooms = Rooms(scene=room(0.0, 0), scan=room(1.0, 1))
     weighed = common_height(tiny_prior, old, new, CONFIG.matching, rooms)
     assert weighed.height_m == pytest.approx(-1.0, abs=0.01)
-    assert weighed.odds[0, 0] > 0
+    assert weighed.odds.matrix()[0, 0] > 0
 
 
 def test_a_floor_that_was_not_seen_does_not_lift_what_fits_without(tiny_prior):
@@ -133,7 +134,7 @@ def test_a_floor_that_was_not_seen_does_not_lift_what_fits_without(tiny_prior):
 def test_a_height_is_believed_that_explains_clearly_more_and_loses_no_pair(odds, expected, believed):
     apart = -9.0 * (1 - np.eye(3))
     pairs = object.__new__(AlignedPairs)  # odds alone are looked at
-    one, other = (Weighed(height_m=0.0, aligned=pairs, odds=x + apart) for x in (odds, expected))
+    one, other = (Weighed(height_m=0.0, aligned=pairs, odds=LogOdds.of(x + apart)) for x in (odds, expected))
     assert one.overrules(other) == believed
 
 

@@ -1,0 +1,42 @@
+"""Points by cells: nothing near or in view is missed, each comes once, and most of what is not is left out."""
+
+import numpy as np
+import pytest
+
+from more2_jax.geometry.free_space import axes_toward
+from more2_jax.geometry.near_points import RADIUS_M, NearPoints
+
+POINTS = np.random.default_rng(0).uniform(-20, 20, (20_000, 3))
+
+
+def missed(wanted, found):
+    assert len(np.unique(found, axis=0)) == len(found)
+    return set(map(tuple, wanted)) - set(map(tuple, found))
+
+
+@pytest.mark.parametrize("reach_m", [0.5, 4.0, 1000.0])
+@pytest.mark.parametrize("place", [(0.0, 0, 0), (-19.9, 3, 20), (70.0, 0, 0)])
+def test_what_is_within_reach_comes_once_and_what_is_not_stays(reach_m, place):
+    near = NearPoints(POINTS)
+    found = near.points_of(near.cells_around(np.array(place), reach_m))
+    distance = np.linalg.norm(POINTS - place, axis=1)
+    assert missed(POINTS[distance <= reach_m], found) == set()
+    assert (np.linalg.norm(found - place, axis=1) <= reach_m + 2 * RADIUS_M).all()
+
+
+@pytest.mark.parametrize("half", [0.05, 0.4, 3.0])
+def test_what_is_in_view_comes_once_and_most_else_stays(half):
+    near, rng = NearPoints(POINTS), np.random.default_rng(1)
+    every = near.cells_around(np.zeros(3), 100.0)
+    for _ in range(5):
+        eye, turn = rng.uniform(-15, 15, 3), axes_toward(rng.normal(size=3))
+        x, y, z = ((POINTS - eye) @ turn.T).T
+        visible = (z > 0) & (np.maximum(np.abs(x), np.abs(y)) <= half * z)
+        found = near.in_view(every, eye, turn[2], half)
+        assert missed(POINTS[visible], found) == set()
+        assert len(found) < len(POINTS) and (half > 1 or len(found) < len(POINTS) / 2)
+
+
+def test_of_no_points_none_are_near():
+    near = NearPoints(np.zeros((0, 3)))
+    assert near.points_of(near.cells_around(np.zeros(3), 5.0)).shape == (0, 3)
