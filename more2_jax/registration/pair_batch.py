@@ -90,7 +90,8 @@ def local_batch(
     """Objects as one batch of one shape for all scenes: (size, `MAX_POINTS`, 3), on the host.
 
     Fillers repeat the first object; `size` is by default the next power of two. `part_of`: the objects of the whole
-    scan; what any of these has (normals, what sensors saw, what lies around) the batch has too, blank where its own have none.
+    scan; what any of these has (normals, what sensors saw, what lies around) the batch has too, blank where its own
+    have none.
     """
     every = objects if part_of is None else part_of
     known = None if all(o.normals is None for o in every) else [o.normals for o in objects]
