@@ -16,11 +16,14 @@ from jax.core import Tracer
 from jaxtyping import Bool, Float
 
 from more2_jax.config import JointConfig
+from more2_jax.geometry.full_precision import full_precision
 from more2_jax.geometry.points import cloud_radius, farthest_points, transformed
 from more2_jax.geometry.se3_descent import adam, descend
 from more2_jax.geometry.transform import rescale, transform
 from more2_jax.network.prior import Prior, field_sdf, object_field
 from more2_jax.types import AnyArray, Embedding, JointFit, pytree, quantity
+
+jax.tree_util.register_static(JointConfig)  # part of a program: `jax.jit(fit_jointly)` takes it as it is
 
 
 @pytree
@@ -52,6 +55,7 @@ def fit_jointly(prior: Prior, observations: Observations, config: JointConfig) -
 
 
 @partial(jax.jit, static_argnames="config")
+@full_precision
 def _fit_many(prior: Prior, observations: Observations, config: JointConfig) -> JointFit:
     return jax.vmap(lambda one: fit_one(prior, one, config))(observations)
 

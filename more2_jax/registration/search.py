@@ -15,6 +15,7 @@ import jaxlie
 from jaxtyping import Array, Float, Int
 
 from more2_jax.config import MotionModel, SurfaceSearch
+from more2_jax.geometry.full_precision import full_precision
 from more2_jax.geometry.point_to_plane import Surface, align_by, coarsened, whole_surface
 from more2_jax.geometry.points import cloud_radius
 from more2_jax.geometry.transform import rescale
@@ -63,6 +64,7 @@ def alignable(batch: LocalBatch, search: SurfaceSearch) -> AlignableObject:
 
 
 @partial(jax.jit, static_argnames="search")
+@full_precision
 def _alignable(batch: LocalBatch, search: SurfaceSearch) -> AlignableObject:
     def one(row: LocalBatch) -> AlignableObject:
         mask = row.cloud.mask
@@ -92,6 +94,7 @@ def search_poses(
 
 
 @partial(jax.jit, static_argnames=("search", "motion"))
+@full_precision
 def _search_poses(
     pairs: tuple[AlignableObject, AlignableObject, jaxlie.SE3], search: SurfaceSearch, motion: MotionModel
 ) -> FoundPoses:

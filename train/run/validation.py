@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float
 
+from more2_jax.geometry.full_precision import full_precision
 from more2_jax.geometry.points import kabsch_rotation
 from more2_jax.network.prior import Prior
 from train.run.settings import TrainingConfig
@@ -64,6 +65,7 @@ def field_scores(
 
 
 @jax.jit
+@full_precision
 def _sample_scores(prior: Prior, sample: TrainingSample) -> dict[str, Array]:
     embedding, predicted = predict(prior, sample, jax.random.key(0), train=False)
     scores = field_scores(predicted, sample.sdf)

@@ -124,7 +124,7 @@ def predict(
 
     def one(params: dict[str, Any], cloud: tuple[Array, ...]) -> tuple[Embedding, Array]:
         points, mask, normals, queries, key = cloud
-        e = encode_ordered(dataclasses.replace(prior, params=params), points, mask, normals)
+        e = encode_ordered(dataclasses.replace(prior, params=params), points, mask, normals, train)
         weights = {"params": params["decoder"]}
         return e, decoder.apply(weights, e, queries, train, rngs={"dropout": key})  # type: ignore[return-value]
 
