@@ -133,14 +133,21 @@ def two_way_rms(a: Sampled, b: Sampled, share: float) -> Float[Array, ""]:
 
 
 def chamfer_distance(
-    a: Float[Array, "n 3"], a_mask: Bool[Array, " n"], b: Float[Array, "m 3"], b_mask: Bool[Array, " m"]
+    a: Float[Array, "n 3"],
+    a_mask: Bool[Array, " n"],
+    b: Float[Array, "m 3"],
+    b_mask: Bool[Array, " m"],
+    squared: bool = False,
 ) -> Float[Array, ""]:
-    """Mean nearest distance a → b plus mean nearest distance b → a, meters; gradient 0 at coincidence."""
+    """Mean nearest distance a → b plus mean nearest distance b → a, meters; gradient 0 at coincidence.
+
+    `squared`: the means of the squares instead, square meters (paper, supplement).
+    """
     total = jnp.zeros((), a.dtype)
     for (x, x_mask), (y, y_mask) in (((a, a_mask), (b, b_mask)), ((b, b_mask), (a, a_mask))):
-        _, squared = nearest(x, x_mask, y, y_mask)
-        length = jnp.sqrt(jnp.where(x_mask, jnp.maximum(squared, TINY), 1.0))
-        total += jnp.where(x_mask, length, 0.0).sum() / jnp.maximum(x_mask.sum(), 1)
+        _, square = nearest(x, x_mask, y, y_mask)
+        gap = square if squared else jnp.sqrt(jnp.where(x_mask, jnp.maximum(square, TINY), 1.0))
+        total += jnp.where(x_mask, gap, 0.0).sum() / jnp.maximum(x_mask.sum(), 1)
     return total
 
 

@@ -117,7 +117,10 @@ def code_drift(code: Embedding, start: Embedding) -> Float[Array, ""]:
 
 
 def best_code(prior: Prior, seen: Observations) -> Embedding:
-    """X*: the code of the observation it explains best, moved into the reference's frame."""
+    """X*: the code of the observation it explains best, moved into the reference's frame.
+
+    What the decoder looks up beside the code is of all observations together.
+    """
 
     def own_loss(code: Embedding, points: Any, mask: Any) -> Array:
         distance = jnp.abs(field_sdf(prior, object_field(prior, code), points))
@@ -126,7 +129,14 @@ def best_code(prior: Prior, seen: Observations) -> Embedding:
     losses = jax.vmap(own_loss)(seen.codes, seen.points, seen.mask)
     best = jnp.argmin(jnp.where(seen.real & jnp.isfinite(losses), losses, jnp.inf))
     code, T = jax.tree.map(lambda x: x[best], (seen.codes, seen.T_ref_obs))
-    return transform(code, T)
+    return with_anchors(transform(code, T), seen.accumulated)
+
+
+def with_anchors(code: Embedding, other: Embedding) -> Embedding:
+    """The code with the anchors of another one of the same frame, where those lie."""
+    shift = other.center - code.center
+    anchors = tuple(dataclasses.replace(a, offset=a.offset + shift) for a in other.anchors)
+    return dataclasses.replace(code, anchors=anchors)
 
 
 def subsample(seen: Observations, points: int) -> Observations:
