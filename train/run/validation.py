@@ -28,7 +28,12 @@ def validate(prior: Prior, shapes: Shapes, config: TrainingConfig) -> dict[str, 
     Where the decoder looks up normals, `bare_*` are the scores of the same clouds without them.
     """
     clean = dataclasses.replace(
-        config, max_views=3, augment_probability=0.0, normals_unknown_probability=0.0, queries=1024
+        config,
+        min_views=1,
+        max_views=3,
+        augment_probability=0.0,
+        normals_unknown_probability=0.0,
+        queries=1024,
     )
     count = min(MOST_VALIDATED, len(shapes.views)) // GROUP * GROUP
     batch = min(BATCH, count)
