@@ -117,6 +117,9 @@ class DescentRegistration:
     learning_rate: float = 1e-3  # radians, and shares of the target's radius
     sdf_weight: float = 1.0  # of |Ψ| at the moved source's points, in the loss
     chamfer_weight: float = 1.0  # of the Chamfer distance
+    chamfer: Literal["squared", "plain"] = (
+        "squared"  # of nearest distances, the mean of the squares (paper, supplement), or their own
+    )
     icp_steps: int = 30  # after the descent
     trim: float = 1.0  # share of nearest distances that counts
     converged_rms: float = 0.05  # share of the target's radius

@@ -173,10 +173,10 @@ def reconstruct(
 ) -> LivingScene:
     """Poses of objects seen more than once are made to agree, or optimized with the code; then meshes are extracted.
 
-    `pose_graph.steps` (`robust`): all observations of an object are aligned with one another at once. `joint.steps`
-    (`paper`): code and poses of all objects are optimized in one call. Observations in doubt
-    (`Observation.accumulated` False) have no part in it. Objects that have a mesh have not changed since and are left
-    alone.
+    `pose_graph.steps` (`robust`): all observations of an object are aligned with one another at once. Codes become
+    those of all observations together (paper §3.4) where `accumulate_target` has not made them so before. `joint.steps`
+    (`paper`): code and poses of all objects are optimized in one call (§3.5). Observations in doubt
+    (`Observation.accumulated` False) have no part in it. Objects with a mesh have not changed since and are left alone.
     """
     timing, objects = dict(scene.timing_s), list(scene.objects)
     todo = [k for k, o in enumerate(objects) if o.mesh is None]
@@ -186,8 +186,10 @@ def reconstruct(
         for start in range(0, len(align), CLOSED_AT_ONCE):
             some = align[start : start + CLOSED_AT_ONCE]
             several = list(accumulated_objects(objects, some, scene.scans))
-            refined = refine_object_poses(prior, several, config)
-            objects = with_refined(objects, some, refined)
+            objects = with_refined(objects, some, refine_object_poses(prior, several, config))
+    anew = [] if config.accumulate_target else again
+    with staged(timing, progress, "encode", len(anew)):
+        objects = embed_accumulated(prior, objects, anew)
     with staged(timing, progress, "joint", len(fit)):
         fitted = fit_objects(prior, list(accumulated_objects(objects, fit, scene.scans)), config)
         objects = with_refined(objects, fit, fitted)

@@ -17,6 +17,7 @@ from jax import Array
 from jaxtyping import Bool, Float, Int
 
 from more2_jax.config import MotionModel
+from more2_jax.geometry.full_precision import full_precision
 from more2_jax.geometry.nearest_grid import NearestGrid, look_up, nearest_grid
 from more2_jax.geometry.points import FAR, nearest_index, thin, transformed
 from more2_jax.types import AnyArray, Sampled, pytree, quantity
@@ -318,6 +319,7 @@ def solvable(H: Float[Array, "6 6"], motion: MotionModel) -> Float[Array, "6 6"]
     return H * free * free[:, None] + jnp.diag(1 - free)
 
 
+@full_precision
 def align_step(
     T: jaxlie.SE3, source: Surface, target: Surface, reach: Float[Array, ""], motion: MotionModel
 ) -> jaxlie.SE3:

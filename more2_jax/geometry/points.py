@@ -8,6 +8,7 @@ import jaxlie
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
+from more2_jax.geometry.full_precision import full_precision
 from more2_jax.geometry.transform import transform
 from more2_jax.types import Sampled
 
@@ -132,17 +133,25 @@ def two_way_rms(a: Sampled, b: Sampled, share: float) -> Float[Array, ""]:
 
 
 def chamfer_distance(
-    a: Float[Array, "n 3"], a_mask: Bool[Array, " n"], b: Float[Array, "m 3"], b_mask: Bool[Array, " m"]
+    a: Float[Array, "n 3"],
+    a_mask: Bool[Array, " n"],
+    b: Float[Array, "m 3"],
+    b_mask: Bool[Array, " m"],
+    squared: bool = False,
 ) -> Float[Array, ""]:
-    """Mean nearest distance a → b plus mean nearest distance b → a, meters; gradient 0 at coincidence."""
+    """Mean nearest distance a → b plus mean nearest distance b → a, meters; gradient 0 at coincidence.
+
+    `squared`: the means of the squares instead, square meters (paper, supplement).
+    """
     total = jnp.zeros((), a.dtype)
     for (x, x_mask), (y, y_mask) in (((a, a_mask), (b, b_mask)), ((b, b_mask), (a, a_mask))):
-        _, squared = nearest(x, x_mask, y, y_mask)
-        length = jnp.sqrt(jnp.where(x_mask, jnp.maximum(squared, TINY), 1.0))
-        total += jnp.where(x_mask, length, 0.0).sum() / jnp.maximum(x_mask.sum(), 1)
+        _, square = nearest(x, x_mask, y, y_mask)
+        gap = square if squared else jnp.sqrt(jnp.where(x_mask, jnp.maximum(square, TINY), 1.0))
+        total += jnp.where(x_mask, gap, 0.0).sum() / jnp.maximum(x_mask.sum(), 1)
     return total
 
 
+@full_precision
 def kabsch(
     source: Float[Array, "n 3"], target: Float[Array, "n 3"], weight: Float[Array, " n"]
 ) -> jaxlie.SE3:
@@ -156,6 +165,7 @@ def kabsch(
     return jaxlie.SE3.from_rotation_and_translation(rotation, target_mean - rotation @ source_mean)
 
 
+@full_precision
 def kabsch_rotation(
     source: Float[Array, "n 3"], target: Float[Array, "n 3"], weight: Float[Array, " n"] | None = None
 ) -> jaxlie.SO3:
@@ -199,12 +209,14 @@ def cloud_radius(points: Float[Array, "n 3"], mask: Bool[Array, " n"]) -> Float[
     return jnp.sqrt(jnp.maximum(jnp.where(mask, squared, 0.0).max(), 1e-12))
 
 
+@full_precision
 def transformed(T_a_b: jaxlie.SE3, points: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
     """The points in frame a: `T_a_b @ points`, with the rotation's matrix made once and not for every point."""
     R = T_a_b.rotation().as_matrix()
     return jnp.matmul(points, R.T, precision="highest") + T_a_b.translation()
 
 
+@full_precision
 def icp_step(T: jaxlie.SE3, source: Sampled, target: Sampled, share: float) -> jaxlie.SE3:
     """One step of trimmed point-to-point ICP with correspondences both ways; returns the new `T_target_source`."""
     moved = transform(source, T)

@@ -12,6 +12,8 @@ import optax
 from jax import Array
 from jaxtyping import Float
 
+from more2_jax.geometry.full_precision import full_precision
+
 V = TypeVar("V")
 
 # Inside Adam's square root: without it the gradient *through* the optimizer is NaN wherever a gradient is 0.
@@ -23,6 +25,7 @@ def adam(learning_rate: float) -> optax.GradientTransformation:
     return optax.adam(learning_rate, eps_root=EPS_ROOT)
 
 
+@full_precision
 def descend(
     loss_fn: Callable[[V], Float[Array, ""]],
     start: V,

@@ -11,6 +11,7 @@ import numpy as np
 from jax import Array
 from jaxtyping import Float
 
+from more2_jax.geometry.full_precision import full_precision
 from more2_jax.geometry.poses import Pose
 
 Record = TypeVar("Record")
@@ -45,6 +46,7 @@ def quantities(record: Any) -> list[tuple[str, str, Any]]:
     return found
 
 
+@full_precision
 def rotation_and_translation(T: jaxlie.SE3 | Pose) -> tuple[Any, Any]:
     """The 3×3 matrix and the shift of a pose, whichever form it has."""
     if isinstance(T, jaxlie.SE3):

@@ -84,7 +84,7 @@ class LocalLookup(nn.Module):
         second = (position[:, :, None] * position[:, None, :]).reshape(-1, 9)
         rows = [
             jnp.concatenate(
-                [s.reshape(len(s), -1), jnp.einsum("ai,aic->ac", position, s), c, position, second],
+                [s.reshape(len(s), -1), _at_anchors(position, s), c, position, second],
                 axis=-1,
             )
             for s, c in zip(*by_bandwidth, strict=True)
@@ -159,7 +159,8 @@ def plane_offsets(
     offset = q - center
     covariance = second - center[:, :, None] * center[:, None, :]
     variance = jnp.maximum(jnp.trace(covariance, axis1=-2, axis2=-1), MIN_VARIANCE)
-    normal_offset = offset - 2 * jnp.einsum("nij,nj->ni", covariance, offset) / variance[:, None]
+    along_plane = jnp.einsum("nij,nj->ni", covariance, offset, precision="highest")
+    normal_offset = offset - 2 * along_plane / variance[:, None]
     return offset, normal_offset, variance
 
 
@@ -222,6 +223,10 @@ def _blended_height(
 def length_of(squared: Float[Array, " n"]) -> Float[Array, "n 1"]:
     """Square root as a column; its gradient at 0 is 0."""
     return jnp.sqrt(jnp.maximum(squared, TINY))[:, None]
+
+
+def _at_anchors(position: Float[Array, "a 3"], slope: Float[Array, "a 3 c"]) -> Float[Array, "a c"]:
+    return jnp.einsum("ai,aic->ac", position, slope, precision="highest")
 
 
 def _products(q: Float[Array, "n 3"], vectors: Float[Array, "n 3 c"]) -> Float[Array, "n c"]:

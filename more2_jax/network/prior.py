@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from contextlib import nullcontext
 from functools import partial
 from importlib import resources
 from pathlib import Path
@@ -19,6 +20,7 @@ from jax.core import Tracer
 from jaxtyping import Bool, Float
 
 from more2_jax.config import PriorConfig, from_dict
+from more2_jax.geometry.full_precision import full_precision
 from more2_jax.geometry.points import cleared, farthest_rows
 from more2_jax.network.decoder import Decoder, ObjectField
 from more2_jax.network.encoder import Encoder, neighbor_counts
@@ -71,10 +73,16 @@ def encode_ordered(
     points: Float[Array, "n 3"],
     mask: Bool[Array, " n"],
     normals: Float[Array, "n 3"] | None = None,
+    train: bool = False,
 ) -> Embedding:
-    """Φ of one cloud already in farthest-point order, unit normals where known; differentiable."""
+    """Φ of one cloud already in farthest-point order, unit normals where known; differentiable.
+
+    `train`: products with weights are as precise as JAX's default on the device, not fully: rounding is less than a
+    batch's noise.
+    """
     encoder = Encoder(prior.config.encoder, keep=prior.config.decoder.local_blocks)
-    return encoder.apply({"params": prior.params["encoder"]}, points, mask, normals)  # type: ignore[return-value]
+    with nullcontext() if train else jax.default_matmul_precision("highest"):
+        return encoder.apply({"params": prior.params["encoder"]}, points, mask, normals)  # type: ignore[return-value]
 
 
 def encode_one(
@@ -128,12 +136,14 @@ def check_embedding(prior: Prior, embedding: Embedding, who: str) -> None:
         )
 
 
+@full_precision
 def object_field(prior: Prior, embedding: Embedding) -> ObjectField:
     """Folds one object's code into the decoder; then `field_sdf` is cheap for many points."""
     decoder = Decoder(prior.config)
     return decoder.apply({"params": prior.params["decoder"]}, embedding, method="field")  # type: ignore[return-value]
 
 
+@full_precision
 def field_sdf(prior: Prior, field: ObjectField, points: Float[Array, "n 3"]) -> Float[Array, " n"]:
     """Signed distance at points of the embedding's local frame; canonical units, negative inside."""
     decoder = Decoder(prior.config)

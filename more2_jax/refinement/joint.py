@@ -16,11 +16,14 @@ from jax.core import Tracer
 from jaxtyping import Bool, Float
 
 from more2_jax.config import JointConfig
+from more2_jax.geometry.full_precision import full_precision
 from more2_jax.geometry.points import cloud_radius, farthest_points, transformed
 from more2_jax.geometry.se3_descent import adam, descend
 from more2_jax.geometry.transform import rescale, transform
 from more2_jax.network.prior import Prior, field_sdf, object_field
 from more2_jax.types import AnyArray, Embedding, JointFit, pytree, quantity
+
+jax.tree_util.register_static(JointConfig)  # part of a program: `jax.jit(fit_jointly)` takes it as it is
 
 
 @pytree
@@ -52,6 +55,7 @@ def fit_jointly(prior: Prior, observations: Observations, config: JointConfig) -
 
 
 @partial(jax.jit, static_argnames="config")
+@full_precision
 def _fit_many(prior: Prior, observations: Observations, config: JointConfig) -> JointFit:
     return jax.vmap(lambda one: fit_one(prior, one, config))(observations)
 
@@ -113,7 +117,10 @@ def code_drift(code: Embedding, start: Embedding) -> Float[Array, ""]:
 
 
 def best_code(prior: Prior, seen: Observations) -> Embedding:
-    """X*: the code of the observation it explains best, moved into the reference's frame."""
+    """X*: the code of the observation it explains best, moved into the reference's frame.
+
+    What the decoder looks up beside the code is of all observations together.
+    """
 
     def own_loss(code: Embedding, points: Any, mask: Any) -> Array:
         distance = jnp.abs(field_sdf(prior, object_field(prior, code), points))
@@ -122,7 +129,14 @@ def best_code(prior: Prior, seen: Observations) -> Embedding:
     losses = jax.vmap(own_loss)(seen.codes, seen.points, seen.mask)
     best = jnp.argmin(jnp.where(seen.real & jnp.isfinite(losses), losses, jnp.inf))
     code, T = jax.tree.map(lambda x: x[best], (seen.codes, seen.T_ref_obs))
-    return transform(code, T)
+    return with_anchors(transform(code, T), seen.accumulated)
+
+
+def with_anchors(code: Embedding, other: Embedding) -> Embedding:
+    """The code with the anchors of another one of the same frame, where those lie."""
+    shift = other.center - code.center
+    anchors = tuple(dataclasses.replace(a, offset=a.offset + shift) for a in other.anchors)
+    return dataclasses.replace(code, anchors=anchors)
 
 
 def subsample(seen: Observations, points: int) -> Observations:

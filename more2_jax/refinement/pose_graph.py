@@ -18,6 +18,7 @@ from jax import Array
 from jaxtyping import Bool, Float
 
 from more2_jax.config import MotionModel
+from more2_jax.geometry.full_precision import full_precision
 from more2_jax.geometry.point_to_plane import (
     ALONG,
     DAMPING,
@@ -54,6 +55,7 @@ class OrientedObservations:
 
 
 @partial(jax.jit, static_argnums=(1, 2))
+@full_precision
 def optimize_pose_graphs(
     observations: OrientedObservations, steps: int, motion: MotionModel
 ) -> Float[Array, "b k 4 4"]:

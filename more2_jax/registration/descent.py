@@ -93,7 +93,9 @@ def registration_loss(
     def loss(T: jaxlie.SE3) -> Float[Array, ""]:
         distance = jnp.abs(field_sdf(prior, field, transformed(T, asked)))
         sdf = jnp.where(real, distance, 0.0).sum() / jnp.maximum(real.sum(), 1)
-        chamfer = chamfer_distance(transformed(T, source.points), source.mask, target.points, target.mask)
+        moved = transformed(T, source.points)
+        squared = settings.chamfer == "squared"
+        chamfer = chamfer_distance(moved, source.mask, target.points, target.mask, squared)
         return settings.sdf_weight * sdf + settings.chamfer_weight * chamfer
 
     return loss

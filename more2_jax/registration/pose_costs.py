@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from more2_jax.config import MotionModel, SurfaceSearch
 from more2_jax.geometry.free_space import looked_through
+from more2_jax.geometry.full_precision import full_precision
 from more2_jax.geometry.point_to_plane import Surface, correspondences
 from more2_jax.geometry.points import FAR, transformed
 from more2_jax.network.prior import Prior, field_sdf, object_field
@@ -109,6 +110,7 @@ def field_cost(costs: Float[Array, " k"], off: Float[Array, " k"], weight: float
     return weight * jnp.where(about_as_good(costs), off, 1.0)
 
 
+@full_precision
 def off_fields(
     prior: Prior, poses: jaxlie.SE3, clouds: tuple[Sampled, Sampled], codes: tuple[Embedding, Embedding]
 ) -> Float[Array, "k 2"]:
@@ -122,6 +124,7 @@ def off_fields(
     return jax.vmap(both_ways)(poses)
 
 
+@full_precision
 def off_field(prior: Prior, T: jaxlie.SE3, cloud: Sampled, code: Embedding) -> Float[Array, ""]:
     """How far a moved sample lies off the completed surface of `code`, as in `off_fields`."""
     distance = jnp.abs(field_sdf(prior, object_field(prior, code), transformed(T, cloud.points)))

@@ -11,7 +11,8 @@ from functools import partial
 
 import jax
 
-from more2_jax.config import DescentRegistration, MotionModel, RegistrationMethod
+from more2_jax.config import DescentRegistration, MotionModel, RegistrationMethod, SurfaceRegistration
+from more2_jax.geometry.full_precision import full_precision
 from more2_jax.network.prior import Prior, check_embedding
 from more2_jax.network.row_map import chunked
 from more2_jax.registration.descent import register_by_descent
@@ -19,6 +20,10 @@ from more2_jax.registration.older_calls import accepts_clouds
 from more2_jax.registration.pair_batch import PairBatch
 from more2_jax.registration.surface import register_by_surfaces
 from more2_jax.types import Registration
+
+# Settings are part of a program: `jax.jit(register)` takes them as they are.
+for _settings in (DescentRegistration, SurfaceRegistration):
+    jax.tree_util.register_static(_settings)
 
 PAIRS_A_CALL = 8  # of descent; `register_by_surfaces` has its own
 
@@ -30,7 +35,8 @@ def register(
     """Registers row i of `pairs.source` onto row i of `pairs.target` (paper §3.3), all in compiled batches.
 
     Refines `pairs.candidates`, or looks for poses itself where there are none. `motion` "upright": shifts and turns
-    about the vertical only. Differentiable under `jax.jit`, `jax.grad` and `jax.jvp`. Raises ValueError when the
+    about the vertical only. Works under `jax.jit` (of which `motion`, if it is given, is a static argument),
+    `jax.vmap`, `jax.grad` and `jax.jvp`. Raises ValueError when the
     decoder cannot be asked about the codes: those of another encoder need a `SurfaceRegistration` whose
     `search.field_weight` is 0.
     """
@@ -44,5 +50,6 @@ def register(
 
 
 @partial(jax.jit, static_argnames="method")
+@full_precision
 def _by_descent(prior: Prior, pairs: PairBatch, method: DescentRegistration) -> Registration:
     return register_by_descent(prior, pairs, method)

@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from more2_jax.config import MotionModel, SurfaceSearch
+from more2_jax.geometry.full_precision import full_precision
 from more2_jax.geometry.point_to_plane import Surface, align_by, coarsened, surrounded, whole_surface
 from more2_jax.geometry.points import cloud_radius
 from more2_jax.geometry.transform import rescale
@@ -64,6 +65,7 @@ def alignable(batch: LocalBatch, search: SurfaceSearch) -> AlignableObject:
 
 
 @partial(jax.jit, static_argnames="search")
+@full_precision
 def _alignable(batch: LocalBatch, search: SurfaceSearch) -> AlignableObject:
     def one(row: LocalBatch) -> AlignableObject:
         mask = row.cloud.mask
@@ -114,6 +116,7 @@ def rows_taken(
 
 
 @partial(jax.jit, static_argnames=("search", "motion"))
+@full_precision
 def _search_poses(
     pairs: tuple[AlignableObject, AlignableObject, jaxlie.SE3], search: SurfaceSearch, motion: MotionModel
 ) -> FoundPoses:

@@ -18,6 +18,7 @@ import jaxlie
 from jaxtyping import Array, Bool, Float, Int
 
 from more2_jax.config import MotionModel, SurfaceRegistration
+from more2_jax.geometry.full_precision import full_precision
 from more2_jax.geometry.point_to_plane import Surface, align, align_step, pose_covariance, thinned
 from more2_jax.geometry.points import two_way_rms
 from more2_jax.geometry.transform import rescale, transform
@@ -78,6 +79,7 @@ def refine_poses(
 
 
 @partial(jax.jit, static_argnames=("settings", "motion"))
+@full_precision
 def _refine_poses(
     prior: Prior,
     pairs: tuple[AlignableObject, AlignableObject, jaxlie.SE3, jaxlie.SE3],

@@ -174,11 +174,17 @@ def test_chamfer_by_definition_and_blind_to_padding():
     again = chamfer_distance(f32(padded), jnp.arange(32) < 20, f32(b), every(31))
     assert float(again) == pytest.approx(expected, rel=1e-3)
     assert float(chamfer_distance(f32(a), every(20), f32(a), every(20))) == pytest.approx(0, abs=1e-6)
+    of_squares = (distances.min(axis=1) ** 2).mean() + (distances.min(axis=0) ** 2).mean()
+    found = chamfer_distance(f32(padded), jnp.arange(32) < 20, f32(b), every(31), squared=True)
+    assert float(found) == pytest.approx(of_squares, rel=1e-3)
 
 
 def test_chamfer_has_a_finite_gradient_at_coincidence():
-    gradient = jax.grad(lambda x: chamfer_distance(x, every(50), f32(CLOUD), every(50)))(f32(CLOUD))
-    assert bool(jnp.isfinite(gradient).all())
+    for squared in (False, True):
+        gradient = jax.grad(
+            lambda x, squared=squared: chamfer_distance(x, every(50), f32(CLOUD), every(50), squared)
+        )(f32(CLOUD))
+        assert bool(jnp.isfinite(gradient).all())
 
 
 # --- Kabsch -----------------------------------------------------------------------------------------------------

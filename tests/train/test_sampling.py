@@ -91,6 +91,10 @@ def test_merged_views_are_at_most_so_many():
     seen = [len(np.unique(cloud)) for cloud in merged]
     assert max(seen) == 3
     assert min(seen) == 1
+    merged = np.asarray(each(lambda k: merge_views(k, views, 8, 256, min_views=5)[0]))
+    # Views are drawn with replacement: seldom fewer than so many, never one alone.
+    seen = [len(np.unique(cloud)) for cloud in merged]
+    assert max(seen) > 5 and min(seen) > 1 and np.mean(np.array(seen) >= 4) > 0.9
 
 
 def test_a_half_space_cuts_a_share_on_one_side_of_a_plane():

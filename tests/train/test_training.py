@@ -27,6 +27,7 @@ from train.shards.losses import (
     LEAST_CORRELATION,
     contrast_loss,
     rotation_loss,
+    scale_loss,
     sdf_loss,
     sign_loss,
     total_loss,
@@ -89,6 +90,16 @@ def test_sign_loss_is_that_of_a_coin_at_zero_and_none_when_sure():
     np.testing.assert_allclose(sign_loss(jnp.zeros(2), truth, 0.01), np.log(2), rtol=1e-6)
     assert sign_loss(truth, truth, 0.01) < 1e-6
     np.testing.assert_allclose(sign_loss(-truth, truth, 0.01), 20.0, rtol=1e-4)
+
+
+def test_scale_loss_is_zero_at_one_and_the_logarithm_pulls_a_vanishing_scale():
+    for error in ("log", "absolute"):
+        assert scale_loss(jnp.ones(3), error) == 0
+        above, below = (float(jax.grad(lambda s, e=error: scale_loss(s, e))(x)) for x in (1.001, 0.999))
+        np.testing.assert_allclose([above, below], [1, -1], rtol=2e-3)
+    np.testing.assert_allclose(scale_loss(jnp.array([0.5, 2.0]), "absolute"), 0.75)
+    slope = jax.grad(lambda s: scale_loss(s, "log"))
+    assert float(slope(1e-3)) == pytest.approx(-1e3, rel=1e-4)
 
 
 def test_up_loss_is_zero_where_the_first_third_points_up_and_one_where_it_says_nothing():

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float
 
+from more2_jax.geometry.full_precision import full_precision
 from more2_jax.geometry.points import kabsch_rotation
 from more2_jax.network.prior import Prior
 from train.run.settings import TrainingConfig
@@ -27,7 +28,12 @@ def validate(prior: Prior, shapes: Shapes, config: TrainingConfig) -> dict[str, 
     Where the decoder looks up normals, `bare_*` are the scores of the same clouds without them.
     """
     clean = dataclasses.replace(
-        config, max_views=3, augment_probability=0.0, normals_unknown_probability=0.0, queries=1024
+        config,
+        min_views=1,
+        max_views=3,
+        augment_probability=0.0,
+        normals_unknown_probability=0.0,
+        queries=1024,
     )
     count = min(MOST_VALIDATED, len(shapes.views)) // GROUP * GROUP
     batch = min(BATCH, count)
@@ -64,6 +70,7 @@ def field_scores(
 
 
 @jax.jit
+@full_precision
 def _sample_scores(prior: Prior, sample: TrainingSample) -> dict[str, Array]:
     embedding, predicted = predict(prior, sample, jax.random.key(0), train=False)
     scores = field_scores(predicted, sample.sdf)

@@ -27,14 +27,19 @@ EDGE_JUMP = 0.1  # a point so far behind another of its cell stands at a depth e
 
 
 def merge_views(
-    key: Array, views: Float[Array, "v n 3"], max_views: int, count: int, one_view: Chance = 0.0
+    key: Array,
+    views: Float[Array, "v n 3"],
+    max_views: int,
+    count: int,
+    one_view: Chance = 0.0,
+    min_views: int = 1,
 ) -> tuple[Cloud, Int[Array, " n"], Int[Array, " n"]]:
-    """`count` points drawn from 1 to `max_views` random views, and view and place there of each.
+    """`count` points drawn from `min_views` to `max_views` random views, and view and place there of each.
 
     `one_view`: the probability of just one.
     """
     number_key, view_key, row_key, point_key, one_key = jax.random.split(key, 5)
-    number = jax.random.randint(number_key, (), 1, max_views + 1)
+    number = jax.random.randint(number_key, (), min_views, max_views + 1)
     number = jnp.where(jax.random.bernoulli(one_key, one_view), 1, number)
     chosen = jax.random.randint(view_key, (max_views,), 0, views.shape[0])
     view = chosen[jax.random.randint(row_key, (count,), 0, number)]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -48,6 +48,15 @@ def up_loss(eqv: Float[Array, "b 2 3 c"]) -> Float[Array, ""]:
     c = eqv.shape[-1]
     up = eqv[..., : c // 3].mean(axis=-1) * jnp.sqrt(1.0 * c)
     return jnp.mean(jnp.sum((up - jnp.array([0.0, 0.0, 1.0])) ** 2, axis=-1))
+
+
+def scale_loss(scale: Float[Array, "*b"], error: Literal["log", "absolute"]) -> Float[Array, ""]:
+    """Mean of |log F_s|, or of the paper's |1 − F_s|.
+
+    Both have the same minimum and slope there. But a scale that shrinks toward 0, where |1 − F_s| has no pull left on
+    the product of all layers, is pushed back by the logarithm.
+    """
+    return jnp.mean(jnp.abs(jnp.log(scale) if error == "log" else 1.0 - scale))
 
 
 def contrast_loss(
@@ -106,9 +115,7 @@ def code_terms(embedding: Embedding, config: LossConfig) -> dict[str, Float[Arra
     """The terms that say what codes should be."""
     return {
         "center": jnp.mean(jnp.linalg.norm(embedding.center + 1e-12, axis=-1)),
-        # Where the paper has |1 − F_s|: the same minimum and slope there, but a scale that shrinks toward 0,
-        # where |1 − F_s| has no pull left on the product of all layers, is pushed back.
-        "scale": jnp.mean(jnp.abs(jnp.log(embedding.scale))),
+        "scale": scale_loss(embedding.scale, config.scale_error),
         "contrast": contrast_loss(embedding.inv[:, 0], embedding.inv[:, 1], config.contrast_temperature),
         "turn": turn_loss(embedding.eqv),
         "rotation": rotation_loss(embedding.eqv),
@@ -124,7 +131,7 @@ def predict(
 
     def one(params: dict[str, Any], cloud: tuple[Array, ...]) -> tuple[Embedding, Array]:
         points, mask, normals, queries, key = cloud
-        e = encode_ordered(dataclasses.replace(prior, params=params), points, mask, normals)
+        e = encode_ordered(dataclasses.replace(prior, params=params), points, mask, normals, train)
         weights = {"params": params["decoder"]}
         return e, decoder.apply(weights, e, queries, train, rngs={"dropout": key})  # type: ignore[return-value]
 

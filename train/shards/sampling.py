@@ -90,8 +90,9 @@ def partial_cloud(
     """A few views merged, noise, then cuts and junk; `count` points in farthest-point order, and their normals."""
     keys, (views, outward) = jax.random.split(key, 7), seen
     open_to_flaws = jax.random.bernoulli(keys[0], config.augment_probability)
+    one_view = open_to_flaws * config.one_view_probability
     points, view, place = merge_views(
-        keys[1], views, config.max_views, config.raw_points, open_to_flaws * config.one_view_probability
+        keys[1], views, config.max_views, config.raw_points, one_view, config.min_views
     )
     points, lost = depth_noise(keys[2], points, view, config, open_to_flaws * config.depth_noise_probability)
     points = points + config.noise * jax.random.normal(keys[3], points.shape)

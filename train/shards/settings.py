@@ -14,6 +14,7 @@ class SampleConfig:
 
     queries: int = 1024  # a cloud: half uniform, half near the surface
     raw_points: int = 2048  # before farthest-point sampling
+    min_views: int = 1
     max_views: int = 8
     noise: float = 0.005
     augment_probability: float = 0.6  # of a cloud to be open to the flaws below (as published)
@@ -45,6 +46,9 @@ class LossConfig:
     near_surface: float = 0.1  # |SDF| below it weighs 1, else 0.5
     center_weight: float = 0.2
     scale_weight: float = 0.01
+    scale_error: Literal["log", "absolute"] = (
+        "log"  # |log F_s|; or |1 − F_s|, as published, with little pull left where F_s vanishes
+    )
     contrast_weight: float = 0.05  # InfoNCE on F_inv between two partial clouds of one shape
     contrast_temperature: float = 0.07
     turn_weight: float = 0.5  # ‖F_eqv − F_eqv'‖² between them: same orientation in, same vectors out
