@@ -102,9 +102,10 @@ def copy(source: Path, target: Path) -> None:
 
 def whole_options(kind: type[Options], part: Part, out: Path) -> Options:
     """The options of one process that does all."""
-    values = part.options | {"out": out, "shard": "1/1", "workers": 0, "ray": None}
+    values: dict[str, Any] = part.options | {"out": out, "shard": "1/1", "workers": 0, "ray": None}
     paths = [k for k, hint in get_type_hints(kind).items() if hint in (Path, Path | None)]
-    return kind(**values | {k: Path(values[k]) for k in paths if values[k] is not None})
+    given: dict[str, Any] = {k: Path(values[k]) for k in paths if values[k] is not None}
+    return kind(**values | given)
 
 
 def together(shares: Sequence[Share]) -> dict[str, Any]:

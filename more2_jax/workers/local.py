@@ -24,7 +24,7 @@ class LocalTeam:
 
     maker: Maker
     size: int
-    _workers: dict[int, tuple[BaseProcess, Connection]] = field(default_factory=dict)
+    _workers: dict[int, tuple[BaseProcess, Any]] = field(default_factory=dict)
     _busy: set[int] = field(default_factory=set)
     _started: int = 0
 
