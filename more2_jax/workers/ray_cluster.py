@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import logging
 import os
+import socket
 from collections.abc import Hashable
 from typing import Any
 
 from more2_jax.workers.dealing import Answer, Desk, Lost, Maker
+
+ANSWER_S = 10.0  # for a cluster to answer at all
 
 
 class RayTeam:
@@ -62,9 +66,13 @@ def connect(address: str) -> Any:
         raise ValueError(
             "Ray is not installed; needed for a cluster: pip install 'more2-jax[cluster]'"
         ) from error
+    _check_answers(address)
     try:
         ray.init(
-            address=None if address == "local" else address, log_to_driver=False, include_dashboard=False
+            address=None if address == "local" else address,
+            log_to_driver=False,
+            include_dashboard=False,
+            logging_level=logging.WARNING,
         )
     except (ConnectionError, ValueError) as error:
         reason = " ".join(str(error).split())
@@ -72,3 +80,16 @@ def connect(address: str) -> Any:
             f"--ray {address}: no cluster there ({reason}); `ray start --head` starts one"
         ) from error
     return ray
+
+
+def _check_answers(address: str) -> None:
+    """Raises ValueError if nothing listens at host:port: Ray itself would try for minutes."""
+    host, _, port = address.removeprefix("ray://").rpartition(":")
+    if not port.isdigit():
+        return
+    try:
+        socket.create_connection((host, int(port)), ANSWER_S).close()
+    except OSError as error:
+        raise ValueError(
+            f"--ray {address}: no cluster there ({error.strerror or error}); `ray start --head` starts one"
+        ) from error

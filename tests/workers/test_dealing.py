@@ -116,3 +116,27 @@ def test_each_task_has_one_outcome_however_many_workers_are_lost(losses, size):
     assert sum(o.tries for o in found) == 7 + sum(o.tries == 2 for o in found)
     # A worker is started in place of one that is lost only if there is a task for it.
     assert team.started <= min(size, 7) + len([1 for lost in losses if lost])
+
+
+@pytest.mark.slow
+def test_actors_of_a_cluster_do_the_same(tmp_path, monkeypatch):
+    pytest.importorskip("ray")
+    from more2_jax.workers.ray_cluster import RayTeam
+
+    monkeypatch.setenv("PYTHONPATH", f"{ROOT}:{ROOT / 'tests/support'}")  # for the actors
+    found = list(work_through(TASKS, RayTeam(Square(tmp_path), "local", 2)))
+    assert sorted(map(str, (o.task for o in found))) == sorted(map(str, TASKS))
+    told = {o.task: o for o in found}
+    assert {n: told[n].answer.value[0] for n in range(6)} == {n: n * n for n in range(6)}
+    assert told["bad"].answer == Answer(error="two lines")
+    assert (told["dies once"].answer.value[0], told["dies once"].tries) == ("dies once", 2)
+    assert "its process ended 2 times (ActorDiedError)" in told["dies"].answer.error
+    assert len(list(tmp_path.glob("made_*"))) <= 2 + 5  # as many as died, and no more
+
+
+def test_no_cluster_is_one_line():
+    pytest.importorskip("ray")
+    from more2_jax.workers.ray_cluster import RayTeam
+
+    with pytest.raises(ValueError, match=r"--ray 127.0.0.1:1: no cluster there"):
+        RayTeam(print, "127.0.0.1:1")
