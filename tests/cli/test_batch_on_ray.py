@@ -33,6 +33,7 @@ def test_forty_scenes_on_two_nodes_of_which_an_actor_is_killed(tmp_path, tiny, c
     from ray.cluster_utils import Cluster
 
     monkeypatch.setenv("PYTHONPATH", str(ROOT))  # for the nodes
+    monkeypatch.setenv("RAY_worker_niceness", "0")  # else it takes for ever beside anything
     for name, shift in (("a", 0.0), ("b", 0.3)):
         scan_file(tmp_path / f"{name}.ply", *boxes(shift))
     (tmp_path / "quick.yaml").write_text(QUICK)
