@@ -126,7 +126,12 @@ class SceneMaker:
 
 
 def build(job: SceneJob, load: Callable[[str], Any]) -> None:
-    """As `more2 run --resume` does; what it says goes to the scene's run.log alone."""
+    """As `more2 run --resume` does; what it says goes to the scene's run.log alone.
+
+    A worker that was killed may have finished the scene before.
+    """
+    if is_finished(job):
+        return
     run_scans(
         job.scans,
         job.out,

@@ -57,8 +57,7 @@ def _acquired(path: Path, folder: Path) -> int | None:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             if _is(file, path):
-                os.ftruncate(file, 0)
-                os.write(file, f"process {os.getpid()} on {socket.gethostname()}, since {_now()}\n".encode())
+                _sign(file, path)
                 return file
         except BlockingIOError as error:
             holder = os.pread(file, 500, 0).decode(errors="replace").strip() or "another process"
@@ -72,13 +71,20 @@ def _acquired(path: Path, folder: Path) -> int | None:
         os.close(file)  # who held it before has removed it meanwhile
 
 
+def _sign(file: int, path: Path) -> None:
+    """Says in the file who holds it; a disk that is full is refused here, before any work."""
+    text = f"process {os.getpid()} on {socket.gethostname()}, since {time.strftime('%Y-%m-%d %H:%M:%S%z')}\n"
+    try:
+        os.ftruncate(file, 0)
+        os.write(file, text.encode())
+    except OSError as error:
+        path.unlink(missing_ok=True)
+        raise OSError(error.errno, error.strerror, str(path)) from error
+
+
 def _is(file: int, path: Path) -> bool:
     """Whether the path still names this file."""
     try:
         return os.path.samestat(os.fstat(file), os.stat(path))
     except FileNotFoundError:
         return False
-
-
-def _now() -> str:
-    return time.strftime("%Y-%m-%d %H:%M:%S%z")

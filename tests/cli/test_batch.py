@@ -298,5 +298,5 @@ def test_a_worker_that_is_killed_costs_nothing(place, tiny, capsys):
     assert capsys.readouterr().err == ""
     assert [r["status"] for r in results(place / "all")] == ["done"] * 6
     logs = [(place / "all" / n / "run.log").read_text() for n in names]
-    assert all(log.count("page: ") == 1 for log in logs)
+    assert all(log.count("objects over 2 scans; seconds") == 1 for log in logs)
     assert not [p for p in (place / "all").iterdir() if p.name.startswith(".")]

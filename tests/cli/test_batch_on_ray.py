@@ -71,5 +71,5 @@ def test_forty_scenes_on_two_nodes_of_which_an_actor_is_killed(tmp_path, tiny, c
     assert {json.dumps({**c, "timing_s": None}) for c in contents} == {
         json.dumps({**contents[0], "timing_s": None})
     }
-    assert all((out / n / "run.log").read_text().count("page: ") == 1 for n in names)
+    assert all((out / n / "run.log").read_text().count("objects over 2 scans; seconds") == 1 for n in names)
     assert [p.name for p in out.iterdir() if p.name.startswith(".")] == []

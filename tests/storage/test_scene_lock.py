@@ -122,3 +122,16 @@ def test_without_locks_in_the_file_system_nothing_is_held(tmp_path, monkeypatch)
     monkeypatch.setattr(module, "fcntl", None)
     with scene_lock(tmp_path / "room"):
         pass
+
+
+def test_a_full_disk_is_refused_before_any_work_and_nothing_is_left(tmp_path, monkeypatch):
+    def full(file, text):
+        raise OSError(module.errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(module.os, "write", full)
+    with (
+        pytest.raises(OSError, match=r"No space left on device: .*room\.lock"),
+        scene_lock(tmp_path / "room"),
+    ):
+        pass
+    assert list(tmp_path.iterdir()) == []
