@@ -26,6 +26,17 @@ def actors():
     return found
 
 
+def manifest(place, prior):
+    """Writes scenes.csv with its scans and settings; the scenes' names."""
+    for name, shift in (("a", 0.0), ("b", 0.3)):
+        scan_file(place / f"{name}.ply", *boxes(shift))
+    (place / "quick.yaml").write_text(QUICK)
+    names = [f"room_{k:02d}" for k in range(SCENES)]
+    rows = [f"{n},a.ply;b.ply,quick.yaml,{prior}" for n in names]
+    (place / "scenes.csv").write_text("\n".join(["name,scans,config,prior", *rows]) + "\n")
+    return names
+
+
 @pytest.mark.slow
 @pytest.mark.skipif(os.name != "posix", reason="sends signals")
 def test_forty_scenes_on_two_nodes_of_which_an_actor_is_killed(tmp_path, tiny, capsys, monkeypatch):
@@ -34,12 +45,7 @@ def test_forty_scenes_on_two_nodes_of_which_an_actor_is_killed(tmp_path, tiny, c
 
     monkeypatch.setenv("PYTHONPATH", str(ROOT))  # for the nodes
     monkeypatch.setenv("RAY_worker_niceness", "0")  # else it takes for ever beside anything
-    for name, shift in (("a", 0.0), ("b", 0.3)):
-        scan_file(tmp_path / f"{name}.ply", *boxes(shift))
-    (tmp_path / "quick.yaml").write_text(QUICK)
-    names = [f"room_{k:02d}" for k in range(SCENES)]
-    rows = [f"{n},a.ply;b.ply,quick.yaml,{tiny}" for n in names]
-    (tmp_path / "scenes.csv").write_text("\n".join(["name,scans,config,prior", *rows]) + "\n")
+    names = manifest(tmp_path, tiny)
     out, seen = tmp_path / "all", []
 
     def kill_one():
