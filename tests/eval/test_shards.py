@@ -188,11 +188,16 @@ def test_a_real_program_in_shards(options, tmp_path):
 
 
 @pytest.mark.slow
-def test_processes_that_stay_alive_give_the_same(options, tmp_path, capsys):
-    """Two workers, another process each: the files of scenes are those of one process, but for seconds."""
-    o = matching.Settings(**{**dataclasses.asdict(options), "preset": "paper", "batch": 4, "workers": 2})
+@pytest.mark.parametrize("where", [{"workers": 2}, {"ray": "local", "workers": 1}], ids=["processes", "ray"])
+def test_workers_give_the_same(options, tmp_path, monkeypatch, where):
+    """Other processes, the actors of a cluster: the files of scenes are those of this process, but for seconds."""
+    if "ray" in where:
+        pytest.importorskip("ray")
+        monkeypatch.setenv("RAY_worker_niceness", "0")
+    monkeypatch.setenv("JAX_DEFAULT_MATMUL_PRECISION", "highest")  # as in this process
+    o = matching.Settings(**{**dataclasses.asdict(options), "preset": "paper", "batch": 4, **where})
     matching.main(o)
-    matching.main(dataclasses.replace(o, out=tmp_path / "alone", workers=0))
+    matching.main(dataclasses.replace(o, out=tmp_path / "alone", workers=0, ray=None))
 
     def told(out):
         files = sorted((out / "scenes").glob("*.json"))
