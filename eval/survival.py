@@ -110,7 +110,7 @@ def main(options: Annotated[Settings, tyro.conf.arg(name="")]) -> None:
         problem = one_moment(place, command, delay, expected)
         rows.append({"command": command, "after_s": delay, "problem": problem})
         print(f"{moment + 1}: {command} killed after {delay:.2f} s: {problem or 'right'}", flush=True)
-    write_json(options.out / "survival.json", {"seed": options.seed, "moments": rows})
+        write_json(options.out / "survival.json", {"seed": options.seed, "moments": rows})
     shutil.rmtree(place.folder)
     bad = sum(bool(r["problem"]) for r in rows)
     print(f"{len(rows) - bad} of {len(rows)} moments right; {options.out / 'survival.json'}")

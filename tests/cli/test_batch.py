@@ -250,9 +250,9 @@ def test_parquet_in_and_out(place, tiny, inline, monkeypatch):
             "scans": ["a.ply", "b.ply"],
             "config": "quick.yaml",
             "prior": str(tiny),
-            "upright": True,
+            "keep_masks": True,
         },
-        {"name": "none", "scans": None, "config": None, "prior": None, "upright": None},
+        {"name": "none", "scans": None, "config": None, "prior": None, "keep_masks": None},
     ]
     parquet.write_table(arrow.Table.from_pylist(rows), place / "scenes.parquet")
     assert go(place / "scenes.parquet", place / "all") == 1
@@ -261,7 +261,7 @@ def test_parquet_in_and_out(place, tiny, inline, monkeypatch):
         ("one", "done", 2),
         ("none", "failed", None),
     ]
-    assert load_scene(place / "all/one")[0].upright
+    assert not load_scene(place / "all/one")[1].repair_masks
     (place / "bad.parquet").write_text("no")
     with pytest.raises(ValueError, match="not Parquet"):
         read_manifest(place / "bad.parquet", place / "all")
