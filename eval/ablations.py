@@ -18,8 +18,8 @@ import tyro
 from eval.data.truth import KnownScene
 from eval.harness.batched import PairToRegister, embed_all, register_all
 from eval.harness.options import Options
-from eval.harness.results import finish
-from eval.harness.runs import run_scenes, start_run
+from eval.harness.program import Program, Summary, carry_out, run_program
+from eval.harness.runs import Run, Work, open_run
 from eval.matching import RECALL, match_own
 from eval.matching import record as match_record
 from eval.reconstruction import Seen, embedded, fitted_in_batches, seen_objects, with_joint
@@ -32,7 +32,6 @@ from more2_jax.geometry.observations import with_poses
 from more2_jax.meshing.object_mesh import object_mesh
 from more2_jax.network.prior import Prior
 from more2_jax.types import AccumulatedObject, ObservedObject
-from train.run.program import run
 
 RATES = {
     "pose": "pose_learning_rate",
@@ -92,7 +91,12 @@ class Settings(Options):
 
 def main(options: Annotated[Settings, tyro.conf.arg(name="")]) -> None:
     """One table a study; methods are named after the study and the setting."""
-    current = start_run("ablations", options, {"scans": options.scans, "samples": options.samples})
+    carry_out(PROGRAM, options)
+
+
+def prepare(options: Settings) -> tuple[Run, Work]:
+    """The run, and what is done with its scenes."""
+    current = open_run("ablations", options, {"scans": options.scans, "samples": options.samples})
     prior, config = current.prior, current.config
 
     def work(scenes: Sequence[KnownScene]) -> list[list[Record]]:
@@ -100,8 +104,7 @@ def main(options: Annotated[Settings, tyro.conf.arg(name="")]) -> None:
         found += joint_study(scenes, prior, config, options)
         return [[r for n, r in found if n == s.name] for s in scenes]
 
-    records = run_scenes(current, options, work)
-    finish(current, options, FIGURES, records)
+    return current, work
 
 
 def matching_study(scenes: Sequence[KnownScene], prior: Prior, o: Settings) -> list[tuple[str, Record]]:
@@ -200,5 +203,7 @@ def joint_records(
     return found
 
 
+PROGRAM = Program(settings=Settings, prepare=prepare, summary=lambda o, right_deg: Summary(figures=FIGURES))
+
 if __name__ == "__main__":
-    run(main)
+    run_program(main)

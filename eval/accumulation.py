@@ -8,7 +8,9 @@ the rotation error of scan k's observation, and the distance of the mesh made th
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated
 
 import numpy as np
@@ -22,16 +24,15 @@ from eval.data.truth import KnownObject, KnownScene
 from eval.end_to_end import living_scenes, on_all_devices
 from eval.harness.options import Options
 from eval.harness.plots import draw_over_scans
-from eval.harness.results import finish
-from eval.harness.runs import run_scenes, start_run
-from eval.scores.figures import Figure, Record
+from eval.harness.program import Program, Summary, carry_out, run_program
+from eval.harness.runs import Run, Work, open_run
+from eval.scores.figures import Figure, Record, Row
 from eval.scores.mesh_scores import mesh_scores, surface_points
 from eval.scores.tracks import Track, pair_record, track_with, tracks_of
 from more2_jax.config import SceneConfig
 from more2_jax.geometry.poses import apply_pose
 from more2_jax.network.prior import Prior
 from more2_jax.scene import reconstruct
-from train.run.program import run
 
 COVERED_M = 0.03  # a true point is covered by an accumulated one within it
 COVERAGE_SAMPLES = 4_000
@@ -61,16 +62,28 @@ class Settings(Options):
 
 def main(options: Annotated[Settings, tyro.conf.arg(name="")]) -> None:
     """Coverage, rotation error and Chamfer distance over the number of scans."""
-    current = start_run("accumulation", options, {"samples": options.samples})
+    carry_out(PROGRAM, options)
+
+
+def prepare(options: Settings) -> tuple[Run, Work]:
+    """The run, and what is done with its scenes."""
+    current = open_run("accumulation", options, {"samples": options.samples})
 
     def one(scene: KnownScene) -> list[Record]:
         right_deg = current.data.right_deg
         found = scene_records(scene, current.prior, current.config, right_deg, options.samples)
         return [{"method": f"ours, {options.preset}", **r} for r in found]
 
-    records = run_scenes(current, options, lambda scenes: on_all_devices(one, scenes, options.at_once))
-    rows = finish(current, options, FIGURES, records, ("scans",))
-    draw_over_scans(current.out / "accumulation", rows, PLOTTED)
+    return current, lambda scenes: on_all_devices(one, scenes, options.at_once)
+
+
+def summary(options: Settings, right_deg: float) -> Summary:
+    """Figures over the number of scans, and their plots."""
+
+    def plots(out: Path, records: object, rows: Sequence[Row]) -> None:
+        draw_over_scans(out / "accumulation", rows, PLOTTED)
+
+    return Summary(figures=FIGURES, groups=("scans",), plots=plots)
 
 
 def scene_records(
@@ -128,5 +141,7 @@ def coverage(points: Float[np.ndarray, "n 3"], surface: Float[np.ndarray, "m 3"]
     return float((KDTree(points).query(surface)[0] < COVERED_M).mean())
 
 
+PROGRAM = Program(settings=Settings, prepare=prepare, summary=summary)
+
 if __name__ == "__main__":
-    run(main)
+    run_program(main)

@@ -22,7 +22,8 @@ from rich.console import Console
 from rich.progress import track
 
 from eval.harness.results import circumstances_now
-from eval.harness.runs import weights_digest, write_json
+from eval.harness.run_folder import write_json
+from eval.harness.runs import weights_digest
 from eval.harness.tables import latex, markdown, on_screen
 from eval.peers.learned_decoders import VARIANTS, decoder_of, decoder_step, drawn, optimizer, start
 from eval.prior_scores import BATCH, SEEN, see_twice

@@ -2,7 +2,7 @@
 
 `python -m eval.end_to_end --data data/flying_sparse --out runs/end_to_end --scenes 10`
 
-Scenes are spread over the devices of a host, `--at-once` on each, and over hosts.
+Scenes are spread over the devices of a host, `--at-once` on each.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ import tyro
 
 from eval.data.truth import KnownScene
 from eval.harness.options import Options
-from eval.harness.results import finish
-from eval.harness.runs import run_scenes, start_run
+from eval.harness.program import Program, Summary, carry_out, run_program
+from eval.harness.runs import Run, Work, open_run
 from eval.peers.end_to_end import NAME, combined
 from eval.scores.divided_masks import with_divided_masks
 from eval.scores.figures import Figure, Record, in_columns
@@ -30,7 +30,6 @@ from more2_jax.config import SceneConfig
 from more2_jax.network.prior import Prior
 from more2_jax.scene import add_scan, reconstruct, start_scene
 from more2_jax.types import LivingScene
-from train.run.program import run
 
 TEMPORAL = {"t-mAP": "t_map", "t-AP50": "t_ap50", "AP50, scans pooled": "ap50"}  # docs/evaluation.md
 
@@ -60,8 +59,13 @@ def figures() -> list[Figure]:
 
 def main(options: Annotated[Settings, tyro.conf.arg(name="")]) -> None:
     """MR and MRR of the method, and of the best of each other stage combined."""
+    carry_out(PROGRAM, options)
+
+
+def prepare(options: Settings) -> tuple[Run, Work]:
+    """The run, and what is done with its scenes."""
     names = [f"ours, {options.preset}", *([NAME] if options.peers else [])]
-    current = start_run("end_to_end", options, {"methods": names, "samples": options.samples})
+    current = open_run("end_to_end", options, {"methods": names, "samples": options.samples})
     prior, config = current.prior, current.config
     both: list[Callable[[KnownScene], list[Track]]] = [
         lambda s: tracks_of(living_scene(s, prior, config)),
@@ -76,8 +80,7 @@ def main(options: Annotated[Settings, tyro.conf.arg(name="")]) -> None:
             for r in records_of(scene, n, m, current.data.right_deg, options.samples)
         ]
 
-    records = run_scenes(current, options, lambda scenes: on_all_devices(one, scenes, options.at_once))
-    finish(current, options, figures(), records, ("to_scan", "category"))
+    return current, lambda scenes: on_all_devices(one, scenes, options.at_once)
 
 
 def on_all_devices(
@@ -131,5 +134,11 @@ def records_of(
     return [{"method": name, **r} for r in [*pairs, whole]]
 
 
+PROGRAM = Program(
+    settings=Settings,
+    prepare=prepare,
+    summary=lambda o, right_deg: Summary(figures=figures(), groups=("to_scan", "category")),
+)
+
 if __name__ == "__main__":
-    run(main)
+    run_program(main)

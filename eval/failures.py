@@ -16,7 +16,7 @@ from scipy.spatial import KDTree
 from eval.data.flyingshape import flyingshape
 from eval.data.truth import KnownObject, KnownScene
 from eval.harness.plots import pyplot, save
-from eval.harness.runs import write_json
+from eval.harness.run_folder import write_json
 from eval.harness.tables import number
 from eval.scores.figures import Record
 from eval.scores.pose_scores import evenly

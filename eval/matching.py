@@ -19,8 +19,8 @@ import tyro
 from eval.data.truth import KnownScene
 from eval.harness.batched import embed_all
 from eval.harness.options import Options, benchmark, is_upright
-from eval.harness.results import finish
-from eval.harness.runs import run_scenes, start_run
+from eval.harness.program import Program, Summary, carry_out, run_program
+from eval.harness.runs import Run, Work, open_run
 from eval.peers import classifier
 from eval.peers.matching import Matcher, matchers
 from eval.scores.figures import COLUMNS, Figure, Record, in_columns
@@ -30,7 +30,6 @@ from more2_jax.matching.color import color_of
 from more2_jax.network.prior import Prior
 from more2_jax.tracking.identify import identify
 from more2_jax.types import Embedding, Instance, ObservedObject
-from train.run.program import run
 
 SHARES = (25, 50, 75, 100)  # %: of a scan pair's objects, for scene recall
 
@@ -68,17 +67,19 @@ class Settings(Options):
 
 def main(options: Annotated[Settings, tyro.conf.arg(name="")]) -> None:
     """Instance and scene recall of the method, of its parts, and of what one would use instead."""
+    carry_out(PROGRAM, options)
+
+
+def prepare(options: Settings) -> tuple[Run, Work]:
+    """The run, and what is done with its scenes."""
     methods = own_settings(options.preset)
     upright = is_upright(options, benchmark(options))
     peers = matchers(upright) if options.peers else {}
     if options.classifier is not None:
         peers |= {classifier.NAME: classifier.classifier(options.classifier, options.batch)}
-    current = start_run("matching", options, {"methods": [*methods, *peers]})
+    current = open_run("matching", options, {"methods": [*methods, *peers]})
     settings = {n: replace(preset(options.preset, upright=upright), matching=m) for n, m in methods.items()}
-    records = run_scenes(
-        current, options, lambda scenes: work(scenes, current.prior, settings, peers, options.batch)
-    )
-    finish(current, options, FIGURES, records, ("to_scan",))
+    return current, lambda scenes: work(scenes, current.prior, settings, peers, options.batch)
 
 
 def own_settings(name: str) -> dict[str, CodeMatcher | EvidenceMatcher]:
@@ -176,5 +177,11 @@ def record(scene: KnownScene, b: int, method: str, matched: dict[int, int], seco
     return {"method": method, "to_scan": b, "seconds": seconds, **scores, **recalls, **counts}
 
 
+PROGRAM = Program(
+    settings=Settings,
+    prepare=prepare,
+    summary=lambda o, right_deg: Summary(figures=FIGURES, groups=("to_scan",)),
+)
+
 if __name__ == "__main__":
-    run(main)
+    run_program(main)

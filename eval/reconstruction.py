@@ -22,8 +22,8 @@ from eval.data.masks import LOST
 from eval.data.truth import KnownObject, KnownScene
 from eval.harness.batched import embed_all
 from eval.harness.options import Options
-from eval.harness.results import finish
-from eval.harness.runs import run_scenes, start_run
+from eval.harness.program import Program, Summary, carry_out, run_program
+from eval.harness.runs import Run, Work, open_run
 from eval.peers.reconstruction import SURFACERS, Surfacer
 from eval.scores.figures import Column, Figure, Record
 from eval.scores.mesh_scores import RECONSTRUCTED, mesh_scores
@@ -35,7 +35,6 @@ from more2_jax.refinement.joint_of_objects import fit_objects
 from more2_jax.scene import remembered
 from more2_jax.tracking.object_views import few_sensors
 from more2_jax.types import AccumulatedObject, Mesh, Observation
-from train.run.program import run
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,12 +78,15 @@ FIGURES = [
 
 def main(options: Annotated[Settings, tyro.conf.arg(name="")]) -> None:
     """Meshes of the method with and without joint optimization, and of what one would use instead."""
+    carry_out(PROGRAM, options)
+
+
+def prepare(options: Settings) -> tuple[Run, Work]:
+    """The run, and what is done with its scenes."""
     peers = SURFACERS if options.peers else {}
     stated = {"methods": [*own_names(options.preset, preset(options.preset)), *peers], "scans": options.scans}
-    current = start_run("reconstruction", options, {**stated, "samples": options.samples})
-
-    records = run_scenes(current, options, lambda s: work(s, current.prior, current.config, peers, options))
-    finish(current, options, FIGURES, records, ("category",))
+    current = open_run("reconstruction", options, {**stated, "samples": options.samples})
+    return current, lambda scenes: work(scenes, current.prior, current.config, peers, options)
 
 
 def own_names(preset: str, config: SceneConfig) -> tuple[str, str]:
@@ -208,5 +210,11 @@ def scored(
     return s.scene.name, {**head, **scores}
 
 
+PROGRAM = Program(
+    settings=Settings,
+    prepare=prepare,
+    summary=lambda o, right_deg: Summary(figures=FIGURES, groups=("category",)),
+)
+
 if __name__ == "__main__":
-    run(main)
+    run_program(main)

@@ -21,8 +21,8 @@ from eval.harness.batched import PairToRegister, embed_all, register_all
 from eval.harness.closed_pairs import closed_poses
 from eval.harness.options import Options, benchmark, is_upright
 from eval.harness.plots import draw_ecdf
-from eval.harness.results import finish
-from eval.harness.runs import run_scenes, start_run
+from eval.harness.program import Program, Summary, carry_out, run_program
+from eval.harness.runs import Run, Work, open_run
 from eval.peers.registration import Registrar, registrars
 from eval.scores.figures import Figure, Record, in_columns
 from eval.scores.pose_scores import Pose, pose_scores
@@ -37,7 +37,6 @@ from more2_jax.config import (
 from more2_jax.geometry.free_space import sight_of
 from more2_jax.network.prior import Prior
 from more2_jax.types import Embedding, Instance, ObservedObject, Scan, Sight
-from train.run.program import run
 
 CLOSED = "laid onto one another"
 KABSCH = "Kabsch on F_eqv alone"  # a learned peer, as FreeReg: one look at the codes
@@ -113,11 +112,15 @@ def figures(right_deg: float) -> list[Figure]:
 
 def main(options: Annotated[Settings, tyro.conf.arg(name="")]) -> None:
     """Registration of true pairs by the method, without its optimization, and by what one would use instead."""
-    data = benchmark(options)
-    upright = is_upright(options, data)
+    carry_out(PROGRAM, options)
+
+
+def prepare(options: Settings) -> tuple[Run, Work]:
+    """The run, and what is done with its scenes."""
+    upright = is_upright(options, benchmark(options))
     ours = own_settings(options.preset, upright)
     peers = registrars() if options.peers else {}
-    current = start_run("registration", options, {"methods": [*ours, *peers], "pairs": options.pairs})
+    current = open_run("registration", options, {"methods": [*ours, *peers], "pairs": options.pairs})
 
     def work(scenes: Sequence[KnownScene]) -> list[list[Record]]:
         pairs = [p for s in scenes for p in true_pairs(s, options.pairs)]
@@ -127,9 +130,16 @@ def main(options: Annotated[Settings, tyro.conf.arg(name="")]) -> None:
         )
         return [[r for s, r in records if s == scene.name] for scene in scenes]
 
-    records = run_scenes(current, options, work)
-    finish(current, options, figures(data.right_deg), records, ("category",))
-    plot(current.out, records, 3 * data.right_deg)
+    return current, work
+
+
+def summary(options: Settings, right_deg: float) -> Summary:
+    """Figures, also by category, and distributions of errors."""
+    return Summary(
+        figures=figures(right_deg),
+        groups=("category",),
+        plots=lambda out, records, rows: plot(out, records, 3 * right_deg),
+    )
 
 
 def own_settings(name: str, upright: bool) -> dict[str, RegistrationMethod]:
@@ -282,5 +292,7 @@ def plot(out: Path, records: Mapping[str, Sequence[Record]], limit_deg: float) -
     draw_ecdf(out / "ecdf_rmse_by_category", ours, "rmse_m.strict", "RMSE, strict [m]", 0.5, by="category")
 
 
+PROGRAM = Program(settings=Settings, prepare=prepare, summary=summary)
+
 if __name__ == "__main__":
-    run(main)
+    run_program(main)

@@ -1,4 +1,4 @@
-"""What every evaluation shares: options, resumable runs over scenes, stages in batches, tables and plots.
+"""What every evaluation shares: options, runs over scenes and their shards, stages in batches, tables and plots.
 
-May import `eval.scores`, `eval.data`, `more2_jax`.
+May import `eval.scores`, `eval.data`, `train.run`, `more2_jax`.
 """

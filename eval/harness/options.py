@@ -52,18 +52,24 @@ class Options:
     """Of 3rscan."""
     fresh: bool = False
     """Forget an earlier run in `out` if its settings, weights or data are others."""
-    distributed: bool = False
-    """Several hosts, each with its share of the scenes: jax.distributed, set up by the cluster."""
+    shard: str = "1/1"
+    """i/n: this process works on the i-th of n shares of the scenes, from 1, and need not know the others.
+    eval.merge makes the tables of all shares."""
+    workers: int = 0
+    """Processes that stay alive over scenes; 0: this one alone. With --ray: actors, 0 for one a GPU, or one a core."""
+    ray: str | None = None
+    """Address of a Ray cluster whose actors do the work ("local" starts one here)."""
 
 
 def benchmark(o: Options) -> Benchmark:
     """The data. Raises ValueError if there are none of that kind, or the masks are not to be had."""
     if not o.data.is_dir():
         raise ValueError(f"{o.data}: no such folder")
-    if o.scenes < 0 or o.visits < 0 or o.visits == 1 or min(o.chunk, o.batch, o.at_once) < 1:
+    if o.scenes < 0 or o.visits < 0 or o.visits == 1 or min(o.chunk, o.batch, o.at_once) < 1 or o.workers < 0:
         raise ValueError(
-            f"scenes {o.scenes}, visits {o.visits}, chunk {o.chunk}, batch {o.batch}, at once {o.at_once}; needed 0"
-            " (all) or more, two visits at least, positive chunk, batch and number at once"
+            f"scenes {o.scenes}, visits {o.visits}, chunk {o.chunk}, batch {o.batch}, at once {o.at_once},"
+            f" workers {o.workers}; needed 0 (all) or more, two visits at least, positive chunk, batch and number at"
+            " once"
         )
     if o.masks == "predicted" and o.dataset != "3rscan":
         raise ValueError(

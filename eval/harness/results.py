@@ -10,30 +10,29 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-import jax
 from rich.console import Console
 
 from eval.harness.options import Options
-from eval.harness.runs import Run, hardware, write_json
+from eval.harness.run_folder import RunFolder, write_json
+from eval.harness.runs import hardware
 from eval.harness.tables import latex, markdown, on_screen
 from eval.scores.figures import Figure, Record, Row, rows_of
 
 
 def finish(
-    run: Run,
+    run: RunFolder,
     o: Options,
     figures: Sequence[Figure],
     records: Mapping[str, Sequence[Record]],
     groups: Sequence[str] = (),
+    circumstances: Mapping[str, Any] | None = None,
 ) -> list[Row]:
-    """Writes and prints all figures of a run; only the first host does. Returns the rows."""
+    """Writes and prints all figures of a run. `circumstances`: where it ran, if not here and now. Returns the rows."""
     rows = rows_of(figures, records, groups)
-    if jax.process_index():
-        return rows
-    write_json(
-        run.out / "results.json", {**provenance(run, o), "rows": [dataclasses.asdict(r) for r in rows]}
-    )
-    title = f"{run.settings['program']}, {run.data.facts['dataset']}, {run.data.facts.get('regime')}"
+    told = provenance(run, o, circumstances_now() if circumstances is None else circumstances)
+    write_json(run.out / "results.json", {**told, "rows": [dataclasses.asdict(r) for r in rows]})
+    facts = run.settings["data"]
+    title = f"{run.settings['program']}, {facts['dataset']}, {facts.get('regime')}"
     (run.out / "tables.md").write_text(markdown(rows, title), encoding="utf-8")
     (run.out / "tables.tex").write_text(latex(rows, title), encoding="utf-8")
     console = Console()
@@ -42,12 +41,12 @@ def finish(
     return rows
 
 
-def provenance(run: Run, o: Options) -> dict[str, Any]:
+def provenance(run: RunFolder, o: Options, circumstances: Mapping[str, Any]) -> dict[str, Any]:
     """Command, data, settings, hardware, versions: what a figure belongs to."""
     return {
-        **circumstances_now(),
+        **circumstances,
         "command": portable(words_of(o, run.settings["program"])),
-        "scenes_asked": o.scenes or len(run.data.names),
+        "scenes_asked": len(run.names),
         "settings": run.settings,
     }
 

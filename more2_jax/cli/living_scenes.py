@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -29,14 +29,18 @@ def run_scans(
     masks: Sequence[Path] = (),
     resume: bool = False,
     reporting: Reporting | None = None,
+    session: Session | None = None,
+    load: Callable[[str], Prior] | None = None,
 ) -> LivingScene:
     """Builds and saves the living scene of scans in time order; bad input is refused before long work.
 
     The folder is saved after every scan, meshes at the end: an interruption leaves the scans so far, and with
-    `resume` the same call goes on from there. `masks` are none, or one a scan in the same order.
+    `resume` the same call goes on from there. `masks` are none, or one a scan in the same order. `session` says things
+    in place of one by `reporting`; `load` finds weights in place of `load_prior`.
     """
     from more2_jax.network.prior import load_prior
     from more2_jax.storage.scene_folder import check_output
+    from more2_jax.storage.scene_lock import scene_lock
 
     reading, reporting = reading or Reading(), reporting or Reporting()
     if not paths:
@@ -47,16 +51,13 @@ def run_scans(
         )
     check_output(out)
     _check_log(reporting, out)
-    with Session(reporting) as session:
+    with scene_lock(out), session or Session(reporting) as session:
         session.log(f"settings: preset {config.preset}, prior {prior_name}, upright {config.upright}")
         scans = read_all(session, paths, config, reading, masks or [None] * len(paths))
         keep_compiled_programs()
-        prior = load_prior(prior_name)
+        prior = (load or load_prior)(prior_name)
         begun = _begun(session, out, scans, config, prior) if resume else None
-        scene = _build(session, prior, scans, out, config, begun)
-        tell(session, scene)
-        _save(session, scene, out, config)
-    return scene
+        return _build(session, prior, scans, out, config, begun)
 
 
 def _build(
@@ -67,7 +68,7 @@ def _build(
     config: SceneConfig,
     scene: LivingScene | None,
 ) -> LivingScene:
-    """Adds the scans `scene` lacks, saves after each, reconstructs."""
+    """Adds the scans `scene` lacks, saves after each, reconstructs and saves. What stops it says what is kept."""
     from more2_jax.scene import add_scan, reconstruct, start_scene
 
     kept = 0 if scene is None else len(scene.scans)
@@ -83,12 +84,22 @@ def _build(
             kept += 1
         if scene is None:
             raise ValueError("no scans; needed at least one")
-        return reconstruct(prior, scene, config, progress=session.watch)
-    except KeyboardInterrupt as error:
+        scene = reconstruct(prior, scene, config, progress=session.watch)
+        tell(session, scene)
+        _save(session, scene, out, config)
+        return scene
+    except (KeyboardInterrupt, OSError) as error:
+        how = f"{kept} of {len(scans)} scans are kept in {out}; the same command with --resume goes on"
+        if isinstance(error, OSError):
+            raise type(error)(f"{reason_of(error)}; {how if kept else f'{out} is as it was'}") from error
         if not kept:
             raise
-        how = f"{kept} of {len(scans)} scans are kept in {out}; the same command with --resume goes on"
         raise KeyboardInterrupt(how) from error
+
+
+def reason_of(error: OSError) -> str:
+    """What the operating system refused, and where."""
+    return str(error) if error.strerror is None else f"{error.filename or 'writing'}: {error.strerror}"
 
 
 def _say_done(session: Session, scene: LivingScene) -> None:
@@ -155,12 +166,33 @@ def add(
     reporting: Reporting,
 ) -> None:
     """Adds one scan to a stored living scene; objects it does not show are left as they are."""
-    from more2_jax.scene import add_scan, reconstruct
-    from more2_jax.storage.scene_folder import check_output, load_scene
+    from more2_jax.storage.scene_folder import check_output, load_scene, stored_at
+    from more2_jax.storage.scene_lock import scene_lock
 
-    scene, config = load_scene(folder)
+    if not stored_at(folder).is_dir():
+        load_scene(folder)  # which says so, before a lock is laid beside what is not there
     check_output(folder)
     _check_log(reporting, folder)
+    with scene_lock(folder):
+        scene, config = load_scene(folder)
+        try:
+            _add(folder, scene, config, path, prior_name, reading, masks, reporting)
+        except OSError as error:
+            raise type(error)(f"{reason_of(error)}; {folder} is as it was") from error
+
+
+def _add(
+    folder: Path,
+    scene: LivingScene,
+    config: SceneConfig,
+    path: Path,
+    prior_name: str | None,
+    reading: Reading,
+    masks: Path | None,
+    reporting: Reporting,
+) -> None:
+    from more2_jax.scene import add_scan, reconstruct
+
     with Session(reporting, steps=_stages_of_add(config) + 2) as session:
         earlier = [_last_source(folder, scene)] if reading.segment == "changes" else []
         (scan,) = read_all(session, [path], config, reading, [masks], earlier)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -12,14 +11,13 @@ from typing import Annotated, Literal
 import tyro
 from tyro.conf import OmitArgPrefixes, OmitSubcommandPrefixes, Positional, arg, subcommand
 
+from more2_jax.cli import batch, places, priors, scenes
 from more2_jax.cli import living_scenes as building
-from more2_jax.cli import places, priors, scenes
-from more2_jax.cli.options import Reading, Reporting
+from more2_jax.cli.options import PresetName, Reading, Reporting
 from more2_jax.cli.session import one_line
 from more2_jax.cli.settings import scene_config
 from more2_jax.cli.settings_page import settings_page
 
-PresetName = Literal["robust", "paper"]
 BAD_INPUT = (ValueError, FileNotFoundError, PermissionError, IsADirectoryError, NotADirectoryError)
 
 
@@ -77,9 +75,7 @@ class Run:
     reporting: Reporting = field(default_factory=Reporting)
 
     def __call__(self) -> int:
-        config = scene_config(self.preset, self.upright, self.config)
-        if self.keep_masks:
-            config = dataclasses.replace(config, repair_masks=False)
+        config = scene_config(self.preset, self.upright, self.config, keep_masks=self.keep_masks)
         building.run_scans(
             self.scans,
             self.out,
@@ -91,6 +87,29 @@ class Run:
             reporting=self.reporting,
         )
         return 0
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Many scenes, one a row of a CSV or Parquet file, each as `more2 run` builds it; the same command goes on.
+
+    Example: more2 batch scenes.csv --out buildings --workers 2
+    """
+
+    manifest: Positional[Path]
+    """Columns: name, scans (in CSV separated by ;), and as needed out, masks, preset, upright, prior, keep_masks,
+    config, unit, instance_property, segment, depth_frames. Paths are relative to the file."""
+    out: Path
+    """Folder of all scenes, each named after its row unless the row says out; and of the table of results."""
+    workers: int | None = None
+    """Processes that stay alive over scenes: 1; with --ray, as many actors as the cluster has room for."""
+    ray: str | None = None
+    """Address of a Ray cluster whose actors do the work ("local" starts one here); all see the same folders."""
+    quiet: bool = False
+    """Print warnings and errors only."""
+
+    def __call__(self) -> int:
+        return batch.run_batch(self.manifest, self.out, workers=self.workers, ray=self.ray, quiet=self.quiet)
 
 
 @dataclass(frozen=True)
@@ -324,6 +343,7 @@ class Settings:
 Command = (
     Annotated[Demo, subcommand("demo")]
     | Annotated[Run, subcommand("run")]
+    | Annotated[Batch, subcommand("batch")]
     | Annotated[Add, subcommand("add")]
     | Annotated[Inspect, subcommand("inspect")]
     | Annotated[Show, subcommand("show")]

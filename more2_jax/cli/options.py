@@ -7,6 +7,8 @@ from pathlib import Path
 from typing import Literal
 
 Unit = Literal["m", "cm", "mm"]
+Segment = Literal["changes", "geometric"]
+PresetName = Literal["robust", "paper"]
 
 
 @dataclass(frozen=True)
@@ -17,7 +19,7 @@ class Reading:
     """Unit of the scans' coordinates."""
     instance_property: str | None = None
     """Property of the points that names the instance, where it is none of the usual."""
-    segment: Literal["changes", "geometric"] | None = None
+    segment: Segment | None = None
     """How to cut scans without masks. changes: by what changed between two or more scans of one room. geometric: one
     scan alone into planes and clusters. Masks from a network are better."""
     depth_frames: bool = False

@@ -46,6 +46,7 @@ class Session:
     console: Console = field(default_factory=_console)
     lines: list[str] = field(default_factory=list)
     steps: int | None = None  # stages to expect of the whole command, for the time left
+    silent: bool = False  # logs alone, warnings too
     _saved: int = 0
     _file: TextIO | None = None
     _bars: Bars | None = None
@@ -70,9 +71,14 @@ class Session:
             self._file.close()
             self._file = None
 
+    @property
+    def quiet(self) -> bool:
+        """Whether it prints warnings and errors at most."""
+        return self.silent or self.reporting.quiet
+
     def say(self, text: str) -> None:
         """Prints and logs."""
-        if not self.reporting.quiet:
+        if not self.quiet:
             self.console.print(text, markup=False, soft_wrap=True)
         self.log(text)
 
@@ -80,7 +86,8 @@ class Session:
         """Prints on standard error and logs; the same warning only once."""
         line = f"warning: {one_line(text)}"
         if not any(logged.endswith(line) for logged in self.lines):
-            print(line, file=sys.stderr, flush=True)
+            if not self.silent:
+                print(line, file=sys.stderr, flush=True)
             self._keep(line)
             self._write("warning", text=one_line(text))
 
@@ -91,18 +98,18 @@ class Session:
 
     def show(self, table: Table) -> None:
         """Prints a table."""
-        if not self.reporting.quiet:
+        if not self.quiet:
             self.console.print(table)
 
     def watch(self, p: Progress) -> None:
         """Takes what a stage tells: a bar on a terminal; elsewhere a line once the stage has ended."""
         about = f"{STAGES[p.stage].doing} {p.scan or 'the scene'}"
-        if self.console.is_terminal and not self.reporting.quiet:
+        if self.console.is_terminal and not self.quiet:
             self._draw(p, about)
         if p.event == "finished":
             line = f"{about}: {p.total} {p.unit}, {p.seconds:.1f} s"
             self._keep(line)
-            if not (self.console.is_terminal or self.reporting.quiet):
+            if not (self.console.is_terminal or self.quiet):
                 self.console.print(line, markup=False, soft_wrap=True)
         counts = {"stage": p.stage, "scan": p.scan, "done": p.done, "total": p.total, "unit": p.unit}
         self._write(p.event, **counts, seconds=round(p.seconds, 3))

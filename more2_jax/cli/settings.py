@@ -11,12 +11,17 @@ import yaml
 from more2_jax.config import SceneConfig, from_dict, preset
 
 
-def scene_config(name: str, upright: bool, path: Path | None) -> SceneConfig:
+def scene_config(name: str, upright: bool, path: Path | None, *, keep_masks: bool = False) -> SceneConfig:
     """The preset called `name` with the values of the YAML file at `path`, if any, in place of its own.
 
-    Raises ValueError, in one line, for an unknown preset or a file that is missing, no YAML, or does not fit.
+    `keep_masks` has masks left as they are. Raises ValueError, in one line, for an unknown preset or a file that is
+    missing, no YAML, or does not fit.
     """
-    base = preset(name, upright=upright)
+    config = _from_file(preset(name, upright=upright), path)
+    return dataclasses.replace(config, repair_masks=False) if keep_masks else config
+
+
+def _from_file(base: SceneConfig, path: Path | None) -> SceneConfig:
     if path is None:
         return base
     if not path.is_file():

@@ -209,6 +209,16 @@ def load_prior(name: str | Path) -> Prior:
     return prior
 
 
+def prior_name(name: str | Path) -> str:
+    """The name that the weights `name` have, of which their scenes tell; they are not loaded. ValueError as there."""
+    path = _locate(name)
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            return json.loads(str(file["__header__"]))["name"]
+    except (KeyError, ValueError, OSError, EOFError) as error:
+        raise ValueError(f"{path}: not a more2_jax weight file ({error})") from error
+
+
 def _flat(params: dict[str, Any]) -> dict[str, Any]:
     return dict(flatten_dict(params, sep="/"))
 

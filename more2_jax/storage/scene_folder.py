@@ -24,6 +24,7 @@ import yaml
 from more2_jax.config import SceneConfig, to_yaml
 from more2_jax.storage.ply_files import read_mesh, read_points, write_mesh, write_points
 from more2_jax.storage.scene_json import VERSION, mesh_name, points_name, scene_to_json
+from more2_jax.storage.scene_lock import scene_lock
 from more2_jax.storage.stored_settings import read_settings
 from more2_jax.types import (
     Anchors,
@@ -111,12 +112,19 @@ def save_scene(
 
     `log` is appended to the folder's run.log. `page` is the scene's HTML (`report.report_html`), stored as
     report.html; with None the folder has no page, `more2 show` makes one. Other files in the folder are kept.
-    Raises ValueError where `check_output` does, when a number of the scene is not finite, or without objects.
+    Raises ValueError where `check_output` does, when a number of the scene is not finite, without objects, or if
+    another process works on the folder.
     """
     check_output(folder)
     if not scene.objects:
         raise ValueError("the living scene has no objects; needed at least one")
     folder = Path(folder).resolve()
+    with scene_lock(folder):
+        _swap_in(scene, folder, config, log, page)
+
+
+def _swap_in(scene: LivingScene, folder: Path, config: SceneConfig, log: str, page: str | None) -> None:
+    """Fills a folder beside, and puts it in the place of the one that is there."""
     new, old = _beside(folder, "new"), _beside(folder, "old")
     folder.parent.mkdir(parents=True, exist_ok=True)
     if old.exists() and not folder.exists():

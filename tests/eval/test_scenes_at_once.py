@@ -9,7 +9,7 @@ import pytest
 
 from eval.end_to_end import on_all_devices
 from eval.harness.options import Options
-from eval.harness.runs import read_ahead
+from eval.harness.runs import chunks, read_ahead
 
 
 @pytest.mark.parametrize("at_once", [1, 2, 3])
@@ -45,6 +45,7 @@ class Letters:
 def test_chunks_are_read_once_and_in_order(names, tmp_path):
     data = Letters()
     options = Options(data=tmp_path, out=tmp_path, chunk=2)
-    got = list(read_ahead(SimpleNamespace(data=data), options, names))
+    parts = list(chunks(names, options.chunk))
+    got = list(read_ahead(SimpleNamespace(data=data), options, parts))
     assert [n for part, _ in got for n in part] == names == data.seen
     assert [s for _, scenes in got for s in scenes] == names and all(len(part) <= 2 for part, _ in got)

@@ -9,6 +9,8 @@ from multiprocessing import get_context
 from types import TracebackType
 from typing import Any, TypeVar
 
+from more2_jax.workers.ray_cluster import connect
+
 T = TypeVar("T")
 R = TypeVar("R")
 
@@ -27,7 +29,7 @@ class Workers:
             # Spawned, not forked: a fork after JAX has started threads may hang.
             self.pool = ProcessPoolExecutor(processes or os.cpu_count(), mp_context=get_context("spawn"))
         else:
-            self.ray = _connect(ray_address)
+            self.ray = connect(ray_address)
 
     def map(self, function: Callable[[T], R], items: Sequence[T]) -> list[R]:
         """`[function(x) for x in items]`, in parallel."""
@@ -46,15 +48,3 @@ class Workers:
             self.pool.shutdown(cancel_futures=True)
         else:
             self.ray.shutdown()
-
-
-def _connect(address: str) -> Any:
-    os.environ.setdefault("RAY_AUTH_MODE", "disabled")
-    try:
-        import ray  # pyright: ignore[reportMissingImports]
-    except ImportError as error:
-        raise ValueError(
-            "Ray is not installed; needed for a cluster: pip install 'more2-jax[cluster]'"
-        ) from error
-    ray.init(address=None if address == "local" else address, log_to_driver=False, include_dashboard=False)
-    return ray

@@ -1,0 +1,83 @@
+"""Shares of a run that know nothing of one another: `--shard 2/8` is the second of eight, whoever computes the others.
+
+Shares are dealt in chunks, not in scenes: scenes of a chunk are encoded in one batch, and a batch of other scenes may
+round otherwise. So shards, a run that was stopped, and one process all compute the same batches.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from eval.harness.options import Options
+from eval.harness.run_folder import RunFolder, write_json
+
+ELSEWHERE = ("data", "out", "shard", "workers", "ray", "fresh")  # options that change no result
+
+
+@dataclass(frozen=True, kw_only=True)
+class Shard:
+    """One of `count` shares, from 1."""
+
+    number: int = 1
+    count: int = 1
+
+    def __str__(self) -> str:
+        return f"{self.number}/{self.count}"
+
+    def of(self, chunks: Sequence[Sequence[str]]) -> list[Sequence[str]]:
+        """Every `count`-th chunk, from the `number`-th."""
+        return list(chunks[self.number - 1 :: self.count])
+
+
+def shard_of(text: str) -> Shard:
+    """The shard that `i/n` names. Raises ValueError for what is none."""
+    found = re.fullmatch(r"(\d+)/(\d+)", text)
+    number, count = (int(found[1]), int(found[2])) if found else (0, 0)
+    if not 1 <= number <= count:
+        raise ValueError(f"--shard {text}; needed i/n with 1 ≤ i ≤ n, such as 2/8")
+    return Shard(number=number, count=count)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Part:
+    """What a shard left in a run's folder beside its scenes: what merging needs, so that it needs no data."""
+
+    options: dict[str, Any]
+    names: tuple[str, ...]  # all scenes of the run
+    right_deg: float
+    circumstances: dict[str, Any]  # hardware, versions, date
+    shard: str
+
+    def same_work(self) -> dict[str, Any]:
+        """The options that must agree between shards of one run."""
+        return {k: v for k, v in self.options.items() if k not in ELSEWHERE}
+
+
+def write_part(run: RunFolder, o: Options, circumstances: dict[str, Any]) -> None:
+    """Notes in the folder what shard worked on it, with which options, where."""
+    shard = shard_of(o.shard)
+    part = Part(
+        options=dataclasses.asdict(o),
+        names=run.names,
+        right_deg=run.right_deg,
+        circumstances=circumstances,
+        shard=str(shard),
+    )
+    folder = run.out / "shards"
+    folder.mkdir(exist_ok=True)
+    write_json(folder / f"{shard.number:04d}_of_{shard.count:04d}.json", dataclasses.asdict(part))
+
+
+def read_parts(out: Path) -> list[Part]:
+    """All shards that worked on a folder. Raises ValueError where none did."""
+    files = sorted((out / "shards").glob("*_of_*.json"))
+    if not files or not (out / "settings.json").is_file():
+        raise ValueError(f"{out}: no run of a program of eval; needed folders that --shard wrote")
+    found = [json.loads(f.read_text()) for f in files]
+    return [Part(**{**p, "names": tuple(p["names"])}) for p in found]

@@ -1,0 +1,211 @@
+"""What is on disk after SIGKILL at random moments of `more2 run`, `add` and `batch`, and what going on makes of it.
+
+`python -m eval.survival --out runs/survival --moments 40 --seed 0`
+
+On scenes of boxes, with the smallest prior: files are under test, not the method. A moment is right if every scene on
+disk opens, and the same command (`--resume`) ends with the bytes of a run that nobody stopped and nothing beside them.
+Seconds, logs and pages, which tell the time, are left out.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import jax
+import numpy as np
+import tyro
+
+from eval.harness.run_folder import write_json
+from more2_jax.config import load_config
+from more2_jax.network.prior import init_prior, save_prior
+from more2_jax.storage.ply_files import write_points
+from more2_jax.storage.scene_folder import load_scene, stored_at
+from train.run.program import run
+from train.run.settings import TrainingRun
+
+Command = Literal["run", "add", "batch"]
+TINY = Path(__file__).parents[1] / "configs" / "tiny.yaml"
+FEW_STEPS = """
+matching: {method: evidence, search: {points: 32, dense: 64, cells: 8, turns: 4, steps: 2, keep: 1}}
+registration:
+  method: surface
+  points: 64
+  steps: 2
+  polish_steps: 2
+  search: {points: 32, dense: 64, cells: 8, turns: 4, steps: 2, keep: 1}
+joint: {points: 64, steps: 2}
+meshing: {coarse: 8, resolution: 16}
+"""
+SIZES_M = np.array([[1.0, 0.5, 0.3], [0.4, 0.4, 1.2], [0.8, 0.9, 0.5]])  # of boxes
+
+
+@dataclass(frozen=True, kw_only=True)
+class Settings:
+    """How often, and where."""
+
+    out: Path
+    """Folder of survival.json and of the scenes, which are removed."""
+    moments: int = 40
+    """Processes that are killed."""
+    seed: int = 0
+    """Of commands and moments."""
+    commands: tuple[Command, ...] = ("run", "add", "batch")
+    """Which."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Place:
+    """A folder with three scans of boxes, settings, weights, and a manifest."""
+
+    folder: Path
+
+    def prepare(self) -> None:
+        """Writes it."""
+        self.folder.mkdir(parents=True, exist_ok=True)
+        rng = np.random.default_rng(0)
+        clouds = [rng.uniform(-0.5, 0.5, (100, 3)) * s for s in SIZES_M]
+        for name, shift, count in (("a", 0.0, 2), ("b", 0.3, 2), ("c", 0.0, 3)):
+            points = np.concatenate([clouds[k] + [2.0 * k + shift, 0, 0] for k in range(count)])
+            write_points(
+                self.folder / f"{name}.ply", points, np.repeat(np.arange(count) + 1, 100), "instance"
+            )
+        config = load_config(TINY, TrainingRun).model
+        save_prior(init_prior(config, jax.random.key(0), "tiny"), self.folder / "tiny.npz")
+        (self.folder / "few.yaml").write_text(FEW_STEPS, encoding="utf-8")
+        rows = [f"room_{k},a.ply;{b}.ply,few.yaml,tiny.npz" for k, b in enumerate("bc")]
+        (self.folder / "scenes.csv").write_text("\n".join(["name,scans,config,prior", *rows]) + "\n")
+
+    def words(self, command: Command, scenes: Path) -> list[str]:
+        """The command line; it makes its scenes below `scenes`."""
+        scans = [str(self.folder / f"{n}.ply") for n in "abc"]
+        more = ["--prior", str(self.folder / "tiny.npz")]
+        if command == "run":
+            options = ["--config", str(self.folder / "few.yaml"), "--resume"]
+            return ["run", *scans, "--out", str(scenes / "room"), *more, *options]
+        if command == "add":
+            return ["add", str(scenes / "room"), scans[2], *more]
+        return ["batch", str(self.folder / "scenes.csv"), "--out", str(scenes)]
+
+
+def main(options: Annotated[Settings, tyro.conf.arg(name="")]) -> None:
+    """Kills, looks, goes on, compares; prints a table and ends with exit code 1 if any moment was not right."""
+    place = Place(folder=(options.out / "place").resolve())
+    place.prepare()
+    whole = {c: undisturbed(place, c) for c in dict.fromkeys(("run", *options.commands))}
+    rng = np.random.default_rng(options.seed)
+    rows = []
+    for moment in range(options.moments):
+        command = options.commands[moment % len(options.commands)]
+        expected, seconds = whole[command]
+        delay = float(rng.uniform(0, seconds))
+        problem = one_moment(place, command, delay, expected)
+        rows.append({"command": command, "after_s": delay, "problem": problem})
+        print(f"{moment + 1}: {command} killed after {delay:.2f} s: {problem or 'right'}", flush=True)
+        write_json(options.out / "survival.json", {"seed": options.seed, "moments": rows})
+    shutil.rmtree(place.folder)
+    bad = sum(bool(r["problem"]) for r in rows)
+    print(f"{len(rows) - bad} of {len(rows)} moments right; {options.out / 'survival.json'}")
+    if bad:
+        sys.exit(1)
+
+
+def undisturbed(place: Place, command: Command) -> tuple[dict[str, bytes], float]:
+    """What the command leaves when nobody stops it, and how long it takes once its programs are compiled."""
+    for _ in range(2):
+        scenes = fresh(place, command, "whole")
+        began = time.perf_counter()
+        subprocess.run(process_words(place, command, scenes), check=True, stdout=subprocess.DEVNULL)
+        seconds = time.perf_counter() - began
+    if command == "run":  # `add` begins with its first two scans
+        first_two = place.words("run", place.folder / "two")
+        words = [
+            sys.executable,
+            "-m",
+            "more2_jax.cli.main",
+            *(w for w in first_two if not w.endswith("c.ply")),
+        ]
+        subprocess.run(words, check=True, stdout=subprocess.DEVNULL)
+    return content(scenes), seconds
+
+
+def fresh(place: Place, command: Command, name: str) -> Path:
+    """A folder as it is before the command."""
+    scenes = place.folder / name
+    shutil.rmtree(scenes, ignore_errors=True)
+    if command == "add":
+        shutil.copytree(place.folder / "two", scenes)
+    else:
+        scenes.mkdir()
+    return scenes
+
+
+def process_words(place: Place, command: Command, scenes: Path) -> list[str]:
+    """How the command is started."""
+    return [sys.executable, "-m", "more2_jax.cli.main", *place.words(command, scenes)]
+
+
+def one_moment(place: Place, command: Command, delay_s: float, expected: dict[str, bytes]) -> str:
+    """What is wrong after a kill, or after going on; nothing if all is right."""
+    scenes = fresh(place, command, "killed")
+    words = process_words(place, command, scenes)
+    process = subprocess.Popen(
+        words, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, start_new_session=True
+    )
+    time.sleep(delay_s)
+    os.killpg(process.pid, signal.SIGKILL)
+    process.communicate()
+    try:
+        found = [load_scene(folder)[0] for folder in scene_folders(scenes)]
+    except ValueError as error:
+        return str(error)
+    if command == "add" and not found:
+        return "the scene is lost"
+    if command != "add" or len(found[0].scans) == 2:  # the third scan is not added twice
+        again = subprocess.run(words, capture_output=True, text=True)
+        if again.returncode:
+            return again.stderr.strip()
+    else:
+        settle(scenes / "room")
+    after = content(scenes)
+    return ", ".join(sorted(k for k in after.keys() | expected.keys() if after.get(k) != expected.get(k)))
+
+
+def settle(folder: Path) -> None:
+    """What a save leaves beside a folder when it is killed after its swap is cleared by the next."""
+    for kind in ("new", "old", "lock"):
+        beside = folder.with_name(f".{folder.name}.{kind}")
+        shutil.rmtree(beside) if beside.is_dir() else beside.unlink(missing_ok=True)
+
+
+def scene_folders(scenes: Path) -> list[Path]:
+    """Every scene that is there, those cut short in a swap too."""
+    names = {p.name.removeprefix(".").removesuffix(".old") for p in scenes.glob("*") if p.is_dir()}
+    return [scenes / n for n in sorted(names) if (stored_at(scenes / n) / "scene.json").is_file()]
+
+
+def content(scenes: Path) -> dict[str, bytes]:
+    """Bytes of all files of all scenes, seconds left out."""
+    found: dict[str, bytes] = {}
+    for path in sorted(p for p in scenes.rglob("*") if p.is_file()):
+        name = str(path.relative_to(scenes))
+        if path.name in ("run.log", "report.html") or path.stem == "results":
+            found[name] = b""
+        elif path.name == "scene.json":
+            scene = json.loads(path.read_text(encoding="utf-8"))
+            found[name] = json.dumps(scene | {"timing_s": None}).encode()
+        else:
+            found[name] = path.read_bytes()
+    return found
+
+
+if __name__ == "__main__":
+    run(main)
