@@ -234,6 +234,18 @@ def compared_objects(
     return old, new
 
 
+def usable(scan: Scan, config: SceneConfig) -> tuple[list[Instance], tuple[Skipped, ...]]:
+    """The instances with enough points, and what is left out; ValueError if nothing remains."""
+    need = config.min_points
+    small = [i for i in scan.instances if len(i.points) < need]
+    skipped = tuple(
+        Skipped(what=f"instance {i.id}", reason=f"{len(i.points)} points; needed {need}") for i in small
+    )
+    if len(small) == len(scan.instances):
+        raise ValueError(f"{scan.name}: {len(small)} instances, none with {need} points or more; needed one")
+    return [i for i in scan.instances if len(i.points) >= need], (*scan.skipped, *skipped)
+
+
 def surroundings_where_masks_may_be_wrong(
     scene: LivingScene, instances: Sequence[Instance], scan: Scan, config: SceneConfig
 ) -> tuple[Sequence[Points | None], Sequence[Points | None]]:
@@ -245,18 +257,6 @@ def surroundings_where_masks_may_be_wrong(
         surroundings_of_objects(scene.objects, scene.scans),
         surroundings([i.points for i in instances], background),
     )
-
-
-def usable(scan: Scan, config: SceneConfig) -> tuple[list[Instance], tuple[Skipped, ...]]:
-    """The instances with enough points, and what is left out; ValueError if nothing remains."""
-    need = config.min_points
-    small = [i for i in scan.instances if len(i.points) < need]
-    skipped = tuple(
-        Skipped(what=f"instance {i.id}", reason=f"{len(i.points)} points; needed {need}") for i in small
-    )
-    if len(small) == len(scan.instances):
-        raise ValueError(f"{scan.name}: {len(small)} instances, none with {need} points or more; needed one")
-    return [i for i in scan.instances if len(i.points) >= need], (*scan.skipped, *skipped)
 
 
 def without_floor_and_walls(instances: list[Instance], scan: Scan, config: SceneConfig) -> Cleared:
