@@ -186,7 +186,8 @@ def reconstruct(
         for start in range(0, len(align), CLOSED_AT_ONCE):
             some = align[start : start + CLOSED_AT_ONCE]
             several = list(accumulated_objects(objects, some, scene.scans))
-            objects = with_refined(objects, some, refine_object_poses(prior, several, config))
+            refined = refine_object_poses(prior, several, config)
+            objects = with_refined(objects, some, refined)
     anew = [] if config.accumulate_target else again
     with staged(timing, progress, "encode", len(anew)):
         objects = embed_accumulated(prior, objects, anew)
