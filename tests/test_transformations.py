@@ -155,11 +155,9 @@ def coarse(f, *at) -> tuple[int, int]:
 
 
 WITHOUT_PRODUCTS = {"chamfer_distance"}
-# matching/code_assignment.py leaves products of codes to the default.
-PRECISE = [name for name in PROGRAMS if name != "match_instances"]
 
 
-@pytest.mark.parametrize("name", PRECISE)
+@pytest.mark.parametrize("name", list(PROGRAMS))
 def test_no_product_is_left_to_the_default_precision(tiny_prior, code, name):
     f, x = of_points(name, tiny_prior, code), jnp.asarray(points())
     for g in (f, jax.grad(f)):

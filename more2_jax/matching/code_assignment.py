@@ -13,6 +13,7 @@ from jax import Array
 from jaxtyping import Bool, Float
 
 from more2_jax.config import CodeMatcher
+from more2_jax.geometry.full_precision import full_precision
 from more2_jax.geometry.points import kabsch_rotation
 from more2_jax.types import Embedding, Matches
 
@@ -30,6 +31,7 @@ def turning_error(a: Float[Array, "3 c"], b: Float[Array, "3 c"]) -> Float[Array
     return jnp.sqrt(jnp.maximum(jnp.sum((turned - b) ** 2), 1e-30))
 
 
+@full_precision
 def pair_score(source: Embedding, target: Embedding, config: CodeMatcher) -> Float[Array, ""]:
     """H = Λ ⊘ E, or one of its factors; differentiable."""
     score = jnp.ones(())

@@ -77,6 +77,23 @@ def test_by_definition_of_every_pair_and_pose(scans):
             assert found.contradicted[p, q] == pytest.approx(max(shares))
 
 
+def test_what_lies_around_the_other_counts_as_the_other_itself(scans):
+    """A mask that is cut: its rest in the background is no distance; its own sample stays its own."""
+    old, new = scans
+    left = old[0].points[:, 0] < 0
+    half = dataclasses.replace(old[0], points=old[0].points[left])
+    rest = dataclasses.replace(half, around=old[0].points[~left])
+    T = np.eye(4)
+    T[:3, 3] = [-0.5, -2, 0]
+    pairs, poses = [[0, 0]], [[T]]
+    whole, cut, mended = (
+        compare(([o], new[:1]), pairs, poses, None)[0].apart[0, 0] for o in (old[0], half, rest)
+    )
+    assert cut[0] > whole[0] + 0.1
+    assert mended[0] == pytest.approx(whole[0], abs=1e-9)
+    assert mended[1] == pytest.approx(cut[1], abs=0.1)  # another sample of the same points
+
+
 def test_moving_a_scan_as_a_whole_changes_nothing(tiny_prior, scans):
     """By whole columns: which points share one is what a scan's own grid says."""
     old, new = scans
