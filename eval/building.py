@@ -60,6 +60,8 @@ class Settings:
     """Points of every object: those of objects with fewer are repeated, with noise. 0: as they are."""
     meshes: bool = True
     """Also refine poses and extract meshes."""
+    keep_masks: bool = False
+    """Leave masks as they are."""
     one: int = 0
     """Measure this size alone, in this process, and print it."""
 
@@ -108,6 +110,8 @@ def measured(options: Settings, count: int) -> Measured:
     """One building, scan by scan, with peaks and seconds of its stages."""
     prior, upright = load_prior(options.prior), flyingshape(options.data).upright
     config = replace(preset(options.preset, upright=upright), memory_mb=options.memory_mb)
+    if options.keep_masks:
+        config = replace(config, repair_masks=False)
     folders = sorted(p.parent for p in options.data.glob("scene_*/scene.json"))
     scans, truth = building([read_scene(folder) for folder in folders], count, options.points)
     watch = Watch()
