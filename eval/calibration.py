@@ -32,7 +32,14 @@ from more2_jax.matching.candidates import compared_at, evidence_at
 from more2_jax.matching.pair_evidence import asks_prior
 from more2_jax.network.embedding_batch import embed
 from more2_jax.network.prior import Prior, load_prior
-from more2_jax.scene import compared_objects, leveled_scan, rooms_of, start_scene, usable
+from more2_jax.scene import (
+    compared_objects,
+    leveled_scan,
+    rooms_of,
+    start_scene,
+    usable,
+    without_floor_and_walls,
+)
 from more2_jax.tracking.scan_frame import common_frame
 from more2_jax.tracking.scan_height import Rooms
 from more2_jax.types import ObservedObject
@@ -121,8 +128,9 @@ def scan_pairs(room: str, scene: KnownScene, prior: Prior, config: SceneConfig) 
     found = []
     for b, scan in enumerate(scene.scans[1:], start=1):
         later, _ = leveled_scan(scan, config, first.scans[0])
-        instances, _ = usable(later, config)
-        codes = embed(prior, [i.points for i in instances])
+        masks, _ = usable(later, config)
+        instances = without_floor_and_walls(masks, later, config).instances
+        codes = embed(prior, [i.points for i in instances], [i.normals for i in instances])
         old, new = compared_objects(first, instances, codes, later, config)
         sides = [o for o, _ in old], new
         one = labels(scene, b, of_first, [i.id for i in instances])
