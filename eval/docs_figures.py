@@ -1,7 +1,7 @@
 """Tables of the documentation, made from what runs left behind: no figure is typed.
 
-`python -m eval.docs_figures keep runs/e2e_cut --name real_cut` stores the figures of a run in docs/figures;
-`python -m eval.docs_figures write` makes the tables of every page anew. A page says where one belongs:
+`python -m eval.docs_figures --keep runs/e2e_cut --name real_cut` stores the figures of a run in docs/figures;
+`python -m eval.docs_figures` makes the tables of every page anew. A page says where one belongs:
 
     <!-- figures: runs = real_cut, real_mix; show = recall, MR -->
     <!-- end of figures -->
@@ -15,7 +15,7 @@ import json
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from train.run.program import run
 
@@ -39,21 +39,18 @@ SENSE = {"higher": 1.0, "lower": -1.0}
 OURS = "ours"  # methods whose names begin so
 
 
-def main(
-    task: Literal["keep", "write"], runs: tuple[Path, ...] = (), *, name: str = "", docs: Path = DOCS
-) -> None:
-    """Stores the figures of a run, or makes the tables of all pages anew.
+def main(keep: Path | None = None, name: str = "", docs: Path = DOCS) -> None:
+    """Makes the tables of all pages anew, or stores the figures of a run.
 
     Args:
-        task: keep the figures of a run, or write the tables.
-        runs: keep: the folder of the run.
-        name: keep: what pages call it.
+        keep: folder of a run whose figures are stored; tables are not written then.
+        name: what pages call it.
         docs: folder of the pages; figures lie in its folder figures.
     """
-    if task == "keep":
-        if len(runs) != 1 or not name:
-            raise ValueError(f"keep got {len(runs)} runs and name {name!r}; needed one run and its name")
-        kept = kept_of(json.loads((runs[0] / "results.json").read_text(encoding="utf-8")))
+    if keep is not None:
+        if not name:
+            raise ValueError(f"{keep}: no name; needed --name, by which pages ask for its figures")
+        kept = kept_of(json.loads((keep / "results.json").read_text(encoding="utf-8")))
         (docs / "figures").mkdir(exist_ok=True)
         text = json.dumps(kept, ensure_ascii=False, indent=1)
         (docs / "figures" / f"{name}.json").write_text(text + "\n", encoding="utf-8")
@@ -98,7 +95,7 @@ def table_of(what: str, figures: Path) -> str:
         path = figures / f"{name}.json"
         if not path.is_file():
             raise ValueError(
-                f"{path}: no such figures; needed `python -m eval.docs_figures keep RUN --name {name}`"
+                f"{path}: no such figures; needed `python -m eval.docs_figures --keep RUN --name {name}`"
             )
         runs[name] = json.loads(path.read_text(encoding="utf-8"))
     lines = of_one(runs[names[0]], shown) if len(runs) == 1 else of_several(runs, shown)

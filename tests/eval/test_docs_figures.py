@@ -42,7 +42,7 @@ def docs(tmp_path):
         folder = tmp_path / "runs" / name
         folder.mkdir(parents=True)
         (folder / "results.json").write_text(json.dumps(RESULTS), encoding="utf-8")
-        main("keep", (folder,), name=name, docs=tmp_path)
+        main(folder, name, tmp_path)
     return tmp_path
 
 
@@ -52,9 +52,7 @@ def test_every_page_shows_what_is_kept():
     for page in pages:
         text = page.read_text(encoding="utf-8")
         assert len(BLOCK.findall(text)) == text.count("<!-- figures:")
-        assert with_tables(text, DOCS / "figures") == text, (
-            f"{page.name}: `python -m eval.docs_figures write`"
-        )
+        assert with_tables(text, DOCS / "figures") == text, f"{page.name}: `python -m eval.docs_figures`"
 
 
 def test_what_is_kept_is_shown_somewhere():
@@ -78,7 +76,7 @@ def test_several_runs_show_ours_beside_the_best_peer(docs):
 
 def test_a_page_is_written_and_the_rest_of_it_stays(docs):
     (docs / "page.md").write_text(f"before\n{ONE}after {ONE}", encoding="utf-8")
-    main("write", docs=docs)
+    main(docs=docs)
     text = (docs / "page.md").read_text(encoding="utf-8")
     assert text.startswith("before\n<!--") and text.count("80.0") == 2 and "old" not in text
 
@@ -90,8 +88,8 @@ def test_a_page_is_written_and_the_rest_of_it_stays(docs):
 def test_what_is_not_there_is_refused(docs, mark, said):
     with pytest.raises(ValueError, match=said):
         with_tables(mark, docs / "figures")
-    with pytest.raises(ValueError, match="needed one run and its name"):
-        main("keep", docs=docs)
+    with pytest.raises(ValueError, match="needed --name"):
+        main(docs / "runs" / "a", docs=docs)
 
 
 def test_only_figures_over_all_scenes_are_kept():
