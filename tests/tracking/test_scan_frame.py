@@ -16,6 +16,7 @@ from more2_jax.matching.candidates import AlignedPairs
 from more2_jax.network.embedding_batch import embed
 from more2_jax.scene import add_scan, start_scene
 from more2_jax.tracking.objects import motion_between
+from more2_jax.tracking.scan_frame import sought_there
 from more2_jax.tracking.scan_height import Rooms, Weighed, best_vote, common_height, doubtful
 from more2_jax.types import Instance, LivingScene, ObservedObject, Scan
 
@@ -85,6 +86,27 @@ def test_a_scan_in_another_frame_shows_what_moved_in_the_scenes(tiny_prior, turn
     for o in made.objects[:4]:
         np.testing.assert_allclose(o.observations[1].T_ref_scan @ T, np.eye(4), atol=0.02)
         assert all(s.frame is made.scans[s.scan].frame or s.scan == 0 for s in o.observations)
+
+
+def test_in_a_building_partners_are_sought_where_its_frame_has_them(tiny_prior):
+    """Two rooms with the same pieces: by their looks alone each would be compared with the first room's."""
+    rooms = [[i.points + [x, 0, 0] for i in furnished("a", 0.0).instances] for x in (0.0, 30.0)]
+    clouds = [c for room in rooms for c in room]
+    old, new = (
+        [ObservedObject(points=c, embedding=e) for c, e in zip(moved, embed(tiny_prior, moved), strict=True)]
+        for moved in (clouds, [c + [100.0, 0, 0] for c in clouds])
+    )
+    matcher = dataclasses.replace(CONFIG.matching, candidates=1)
+    weighed = common_height(tiny_prior, old, new, matcher, Rooms())
+    T = np.eye(4)
+    T[0, 3] = -100.0
+    sought = sought_there(tiny_prior, weighed, matcher, "upright", T)
+    true = {(k, k) for k in range(len(clouds))}
+    before, after = (set(map(tuple, w.odds.pairs.tolist())) for w in (weighed, sought))
+    assert true <= after and not true <= before
+    assert sought.height_m == weighed.height_m
+    shift_of_pairs = sought.aligned.T_old_new[[p[0] == p[1] for p in sought.odds.pairs], 0, 0, 3]
+    np.testing.assert_allclose(shift_of_pairs, -100.0, atol=0.1)
 
 
 def test_scans_of_one_frame_keep_it_to_the_last_bit(together):
