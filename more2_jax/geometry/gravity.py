@@ -25,6 +25,10 @@ LEAST_POINTS = 200
 LEAST_WIDTH_M = (
     0.15  # standard deviation of the levels' points, the narrower way: of a strip half a meter wide
 )
+LEAST_THIN = (
+    0.75  # of the points about the fullest level, so many lie within `SCALE_M`: clutter lies anywhere,
+)
+LEAST_GAIN = 1.1  # and levels hold so much more than along z, or up is z
 REACH_M = 50.0  # along an axis: a stray point a kilometer off must not make a million layers
 TRIED_POINTS = 5000  # at even steps, along the directions tried
 MOST_POINTS = 20_000  # at even steps, for the rest
@@ -53,7 +57,8 @@ class Gravity:
 def gravity(points: Points) -> Gravity | None:
     """The common normal of the levels of a background, within about `MAX_TILT_DEG` of z.
 
-    None where levels hold less than `LEAST_ON_LEVELS` of the points: no floor is seen, or z is not up.
+    None where levels hold less than `LEAST_ON_LEVELS` of the points, or the fullest is no thin one: no floor is seen,
+    or z is not up. z itself where the scan's levels hold hardly less along it.
     """
     points = about_middle(points[:: max(1, -(-len(points) // MOST_POINTS))])
     if len(points) < LEAST_POINTS:
@@ -68,6 +73,12 @@ def gravity(points: Points) -> Gravity | None:
         if fitted is None:
             return None
         up = fitted
+    levels = list(levels_along(points @ up))
+    if not levels or thinness(points @ up, levels[0][0]) < LEAST_THIN:
+        return None
+    along_z = sum(held for _, held in levels_along(points[:, 2]))
+    if share < LEAST_GAIN * along_z:
+        return Gravity(up=np.array([0.0, 0.0, 1.0]), share=float(along_z))
     found = Gravity(up=up, share=float(share))
     return found if found.tilt_deg <= MAX_TILT_DEG + GRIDS_DEG[0] else None
 
@@ -130,6 +141,17 @@ def levels_along(height: Float[np.ndarray, " n"]) -> Iterator[tuple[float, float
             return
         if share[k] == share[max(0, k - 4) : k + 5].max():
             yield float(middles[k]), float(share[k])
+
+
+def thinness(along: Float[np.ndarray, " n"], height: float) -> float:
+    """Of the points about a level, the share that lies on it: near 1 of a floor, a quarter of what fills the space.
+
+    Less those of walls, which are as dense beyond the level as about it.
+    """
+    off = np.abs(along - np.median(along[np.abs(along - height) <= BAND_M]))
+    on, about, beyond = ((off <= reach).sum() for reach in (SCALE_M, 2 * BAND_M, 4 * BAND_M))
+    wall = (beyond - about) / (2 * BAND_M)  # a meter of height, both sides
+    return float((on - wall * SCALE_M) / max(about - wall * 2 * BAND_M, LEAST_ON_LEVEL * len(along)))
 
 
 def common_normal(points: Points, up: Direction, heights: list[float]) -> Direction | None:

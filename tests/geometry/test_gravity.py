@@ -179,3 +179,19 @@ def test_leveling_turns_up_to_z_by_the_least_turn_and_holds_a_point():
 
 def test_what_is_up_already_is_not_turned():
     np.testing.assert_array_equal(least_turn(np.array([0.0, 0.0, 1.0])), np.eye(3))
+
+
+@pytest.mark.parametrize(("seed", "pieces"), [(2, 4), (4, 6), (6, 6), (6, 8), (11, 6)])
+def test_ends_of_furniture_without_a_floor_tilt_nothing(seed, pieces):
+    """What masks lost of a few pieces is all the background there is: ends of upright sides, at many heights."""
+    rng, parts = np.random.default_rng(seed), []
+    for _ in range(pieces):
+        size = rng.uniform([0.4, 0.3, 0.4], [1.8, 0.9, 1.6])
+        points = rng.uniform(-0.5, 0.5, (1500, 3))
+        points[:, rng.integers(0, 2)] = rng.choice([-0.5, 0.5], 1500)
+        out = np.linalg.norm(points * size, axis=1)
+        points = points[out > np.quantile(out, 0.6 if pieces == 4 else 0.8)]
+        turn = Rotation.from_rotvec([0, 0, rng.uniform(0, np.pi)]).as_matrix()
+        parts.append(((points + [0, 0, 0.5]) * size) @ turn.T + rng.uniform([0, 0, 0], [5, 4, 0]))
+    found = gravity(np.concatenate(parts))
+    assert found is None or found.tilt_deg < 0.5
