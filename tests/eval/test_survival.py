@@ -13,6 +13,7 @@ from more2_jax.storage.scene_folder import save_scene
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="sends signals")
 
 
+@pytest.mark.slow
 def test_a_few_moments_of_run_and_add(tmp_path, capsys):
     survival.main(survival.Settings(out=tmp_path, moments=2, seed=1, commands=("run", "add")))
     told = json.loads((tmp_path / "survival.json").read_text())
