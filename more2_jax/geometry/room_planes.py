@@ -23,6 +23,10 @@ BEHIND_M = 0.05  # and farther lies behind a plane
 MOST_BEHIND = 0.01  # share of all points around
 FEWEST = 60  # points of a plane
 LEAST_WIDTH_M = 0.15  # standard deviation of a plane's points the narrower way: of a strip half a meter wide
+BEYOND_M, LEAST_BEYOND = (
+    0.25,
+    0.3,
+)  # of a plane's points so many lie farther from the cloud: more than a mask cut off
 CONTINUES_M = 0.25  # so near the background's own points a plane goes on
 NEIGHBORS = 12  # of a point, itself among them: its normal
 TRIES, PLANES = 150, 8  # planes tried, at even steps; those found in turn, whether they bound the room or not
@@ -52,7 +56,8 @@ def room_planes(cloud: Points, background: Points, room: Points) -> list[RoomPla
     """The planes that bound the room around a cloud; `room` is all of the scan, `background` what is no object."""
     tree = KDTree(cloud)
     near, around = (within(tree, p, AROUND_M) for p in (background, room))
-    return [p for p in planes_of(near) if is_wide(p.points) and behind(p, around) <= MOST_BEHIND]
+    wide = (p for p in planes_of(near) if is_wide(p.points) and goes_on(p, tree))
+    return [p for p in wide if behind(p, around) <= MOST_BEHIND]
 
 
 def planes_of(points: Points) -> Iterator[RoomPlane]:
@@ -100,6 +105,11 @@ def is_wide(points: Points) -> bool:
     """Whether a plane's points spread in it both ways."""
     variance = np.linalg.eigvalsh(np.cov(points.T))
     return bool(np.sqrt(max(variance[1], 0.0)) >= LEAST_WIDTH_M)
+
+
+def goes_on(plane: RoomPlane, tree: KDTree) -> bool:
+    """Whether a plane goes on where the cloud ends; the rest of a tabletop that was cut off does not."""
+    return float((tree.query(plane.points)[0] > BEYOND_M).mean()) >= LEAST_BEYOND
 
 
 def behind(plane: RoomPlane, room: Points) -> float:

@@ -62,6 +62,15 @@ def test_what_was_cut_off_a_table_is_no_floor():
     assert rows_left(table[~cut], np.concatenate([ROOM, table[cut]])).all()
 
 
+def test_the_front_of_a_cabinet_whose_edges_were_cut_off_is_no_wall():
+    """Nothing is behind a front that one scan saw, and its edges lie in the background; it ends with the cabinet."""
+    rng = np.random.default_rng(7)
+    front = np.stack([rng.uniform(0, 1.2, 4000), np.zeros(4000), rng.uniform(0, 1.8, 4000)], axis=1)
+    inner = (np.abs(front - [0.6, 0, 0.9]) < [0.45, 1, 0.7]).all(axis=1)
+    side = np.stack([np.zeros(900), rng.uniform(-0.6, 0, 900), rng.uniform(0, 1.8, 900)], axis=1)
+    assert rows_left(np.concatenate([front[inner], side]), front[~inner]).all()
+
+
 def test_a_picture_on_the_wall_stays():
     rng = np.random.default_rng(4)
     picture = sheet([1.0, 0.01, 1.0], [0.6, 0, 0], [0, 0, 0.5], rng)
