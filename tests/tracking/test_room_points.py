@@ -67,7 +67,7 @@ def test_the_front_of_a_cabinet_whose_edges_were_cut_off_is_no_wall():
     rng = np.random.default_rng(7)
     front = np.stack([rng.uniform(0, 1.2, 4000), np.zeros(4000), rng.uniform(0, 1.8, 4000)], axis=1)
     inner = (np.abs(front - [0.6, 0, 0.9]) < [0.45, 1, 0.7]).all(axis=1)
-    side = np.stack([np.zeros(900), rng.uniform(-0.6, 0, 900), rng.uniform(0, 1.8, 900)], axis=1)
+    side = np.stack([np.zeros(4000), rng.uniform(-0.6, 0, 4000), rng.uniform(0, 1.8, 4000)], axis=1)
     assert rows_left(np.concatenate([front[inner], side]), front[~inner]).all()
 
 
