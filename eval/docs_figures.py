@@ -87,7 +87,7 @@ def with_tables(text: str, figures: Path) -> str:
 def table_of(what: str, figures: Path) -> str:
     """The table of one mark, in Markdown."""
     asked = dict(part.strip().split(" = ", 1) for part in what.split(";"))
-    names, shown = ([x.strip() for x in re.split(r",(?! paper)", asked[key])] for key in ("runs", "show"))
+    names, shown = ([x.strip() for x in re.split(r",(?! paper's)", asked[key])] for key in ("runs", "show"))
     if unknown := [x for x in shown if x not in FIGURES]:
         raise ValueError(f"figures {unknown}; needed some of {list(FIGURES)}")
     runs = {}
