@@ -51,6 +51,10 @@ class RoomPlane:
             on[on] = np.isfinite(KDTree(self.points).query(points[on], distance_upper_bound=CONTINUES_M)[0])
         return on
 
+    def is_near(self, points: Points) -> Bool[np.ndarray, " n"]:
+        """Which points lie on the plane or hardly off it, whichever way they face: corners, too, where walls meet."""
+        return np.abs(points @ self.normal - self.offset_m) < 2 * OFF_M
+
 
 def room_planes(cloud: Points, background: Points, room: Points) -> list[RoomPlane]:
     """The planes that bound the room around a cloud; `room` is all of the scan, `background` what is no object."""

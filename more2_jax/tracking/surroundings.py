@@ -13,15 +13,13 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from more2_jax.geometry.poses import Points, apply_pose
-from more2_jax.geometry.room_planes import on_planes, room_planes, within
+from more2_jax.geometry.room_planes import room_planes, within
 from more2_jax.tracking.objects import accumulated, points_of
 from more2_jax.types import ScanRecord, SceneObject
 
 REACH = 0.5  # shares of an object's radius: what lies so near may be a part of it
 LEAST_REACH_M = 0.2
 OTHER_POINTS = 500  # of another object, about as dense as a scan's background is remembered
-LEAST_SHARE = 0.05  # of a cloud's points: fewer are strips of floor and wall, not a part that was cut off
-
 NOTHING = np.zeros((0, 3))
 
 
@@ -53,6 +51,6 @@ def around(cloud: Points, background: Points, others: Points, room: Points) -> P
     radius = np.linalg.norm(cloud - cloud.mean(axis=0), axis=1).max()
     tree, reach = KDTree(cloud), max(REACH * radius, LEAST_REACH_M)
     near, beside = (within(tree, p, reach) for p in (background, others))
-    on, _ = on_planes(near, room_planes(cloud, background, room), np.concatenate([near, cloud]))
-    found = np.concatenate([near[~on], beside])
-    return found if len(found) >= LEAST_SHARE * len(cloud) else NOTHING
+    for plane in room_planes(cloud, background, room):
+        near = near[~plane.is_near(near)]
+    return np.concatenate([near, beside])
