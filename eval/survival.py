@@ -34,6 +34,7 @@ from train.run.settings import TrainingRun
 
 Command = Literal["run", "add", "batch"]
 TINY = Path(__file__).parents[1] / "configs" / "tiny.yaml"
+# Few steps: the command line is under test, not the method.
 FEW_STEPS = """
 matching: {method: evidence, search: {points: 32, dense: 64, cells: 8, turns: 4, steps: 2, keep: 1}}
 registration:

@@ -25,10 +25,9 @@ LEAST_POINTS = 200
 LEAST_WIDTH_M = (
     0.15  # standard deviation of the levels' points, the narrower way: of a strip half a meter wide
 )
-LEAST_THIN = (
-    0.75  # of the points about the fullest level, so many lie within `SCALE_M`: clutter lies anywhere,
-)
-LEAST_GAIN = 1.1  # and levels hold so much more than along z, or up is z
+# Of the points about the fullest level so many lie within `SCALE_M`: clutter lies at any height.
+LEAST_THIN = 0.8
+LEAST_GAIN = 1.1  # levels hold so many times what they hold along z, or up is z
 REACH_M = 50.0  # along an axis: a stray point a kilometer off must not make a million layers
 TRIED_POINTS = 5000  # at even steps, along the directions tried
 MOST_POINTS = 20_000  # at even steps, for the rest

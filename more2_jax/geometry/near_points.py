@@ -10,9 +10,8 @@ from more2_jax.geometry.poses import Points
 
 CELL_M = 1.0  # a side: about as many points in a cell as cells in a room
 RADIUS_M = CELL_M * np.sqrt(3) / 2  # of the ball that holds a cell
-SIDES = np.array(
-    [1 << 42, 1 << 21, 1]
-)  # makes one number of a cell; a million cells either way along each axis
+# Makes one number of a cell; a million cells either way along each axis
+SIDES = np.array([1 << 42, 1 << 21, 1])
 
 
 class NearPoints:

@@ -23,10 +23,8 @@ BEHIND_M = 0.05  # and farther lies behind a plane
 MOST_BEHIND = 0.01  # share of all points around
 FEWEST = 60  # points of a plane
 LEAST_WIDTH_M = 0.15  # standard deviation of a plane's points the narrower way: of a strip half a meter wide
-BEYOND_M, LEAST_BEYOND = (
-    0.25,
-    0.3,
-)  # of a plane's points so many lie farther from the cloud: more than a mask cut off
+BEYOND_M = 0.25  # farther from the cloud than what a mask cut off,
+LEAST_BEYOND = 0.3  # a floor or wall has such a share of its points
 CONTINUES_M = 0.25  # so near the background's own points a plane goes on
 NEIGHBORS = 12  # of a point, itself among them: its normal
 TRIES, PLANES = 150, 8  # planes tried, at even steps; those found in turn, whether they bound the room or not

@@ -19,9 +19,8 @@ from more2_jax.matching.assignment import FARTHEST_M
 from more2_jax.types import ObservedObject
 
 ROWS_AT_ONCE = 512  # objects that are scored against all instances at a time
-ROOM_M = (
-    15.0  # where a scan's objects lie farther apart than this it is more than a room, and places tell much:
-)
+# Where a scan's objects lie farther apart than this it is more than a room, and places tell much:
+ROOM_M = 15.0
 NEAR_M = FARTHEST_M  # partners are then sought first within what an object is expected to move at most,
 ANYWHERE = 4  # and one in so many of them anywhere: some things are carried off, and frames may differ
 FAR = 1e3  # taken off the score of what is not near: more than any two scores differ by

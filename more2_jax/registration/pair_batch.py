@@ -98,9 +98,8 @@ def local_batch(
     padded = pad_clouds([o.points for o in objects], MAX_POINTS, known)
     at = np.arange(size or bucket(len(objects)))
     at = np.where(at < len(objects), at, 0)
-    cloud = jax.tree.map(
-        lambda x: np.asarray(x)[at], padded
-    )  # on the host: every size would be compiled anew
+    # On the host: every size would be compiled anew.
+    cloud = jax.tree.map(lambda x: np.asarray(x)[at], padded)
     origin = np.asarray(cloud.origin)
     code = jax.tree.map(lambda *x: np.stack(x), *(objects[k].embedding for k in at))
     sight = padded_sights([o.sight for o in objects], origin, any(o.sight is not None for o in every))

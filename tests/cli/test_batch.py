@@ -9,7 +9,7 @@ from collections import deque
 
 import psutil
 import pytest
-from command_line import QUICK, boxes, refused, run_quickly, scan_file
+from command_line import FEW_STEPS, boxes, refused, run_quickly, scan_file
 
 from more2_jax import scene
 from more2_jax.cli import batch
@@ -56,7 +56,7 @@ def place(tmp_path, tiny):
     """Scans a and b, and quick settings."""
     for name, shift in (("a", 0.0), ("b", 0.3)):
         scan_file(tmp_path / f"{name}.ply", *boxes(shift))
-    (tmp_path / "quick.yaml").write_text(QUICK)
+    (tmp_path / "quick.yaml").write_text(FEW_STEPS)
     return tmp_path
 
 

@@ -8,7 +8,7 @@ import time
 
 import psutil
 import pytest
-from command_line import QUICK, boxes, scan_file
+from command_line import FEW_STEPS, boxes, scan_file
 from places import ROOT
 
 from more2_jax.cli.main import main
@@ -30,7 +30,7 @@ def manifest(place, prior):
     """Writes scenes.csv with its scans and settings; the scenes' names."""
     for name, shift in (("a", 0.0), ("b", 0.3)):
         scan_file(place / f"{name}.ply", *boxes(shift))
-    (place / "quick.yaml").write_text(QUICK)
+    (place / "quick.yaml").write_text(FEW_STEPS)
     names = [f"room_{k:02d}" for k in range(SCENES)]
     rows = [f"{n},a.ply;b.ply,quick.yaml,{prior}" for n in names]
     (place / "scenes.csv").write_text("\n".join(["name,scans,config,prior", *rows]) + "\n")

@@ -10,7 +10,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 import pytest
-from command_line import QUICK, boxes, heed_interrupts, refused, run_quickly, scan_file
+from command_line import FEW_STEPS, boxes, heed_interrupts, refused, run_quickly, scan_file
 
 from more2_jax.cli import living_scenes as building
 from more2_jax.cli.main import main
@@ -52,7 +52,7 @@ def three(tmp_path) -> list[Path]:
 
 def command(scans, out: Path, prior: Path) -> list[str]:
     settings = out.with_name("quick.yaml")
-    settings.write_text(QUICK)
+    settings.write_text(FEW_STEPS)
     return [str(a) for a in ("run", *scans, "--out", out, "--prior", prior, "--config", settings)]
 
 

@@ -7,30 +7,19 @@ from pathlib import Path
 import numpy as np
 from places import ROOT
 
+from eval.survival import FEW_STEPS
 from more2_jax.cli.main import main
 from more2_jax.config import load_config
 from more2_jax.storage.ply_files import write_points
 from train.run.settings import TrainingRun
 
 TINY = load_config(ROOT / "configs/tiny.yaml", TrainingRun).model
-# Few steps: the command line is under test here, not the method.
-QUICK = """
-matching: {method: evidence, search: {points: 32, dense: 64, cells: 8, turns: 4, steps: 2, keep: 1}}
-registration:
-  method: surface
-  points: 64
-  steps: 2
-  polish_steps: 2
-  search: {points: 32, dense: 64, cells: 8, turns: 4, steps: 2, keep: 1}
-joint: {points: 64, steps: 2}
-meshing: {coarse: 8, resolution: 16}
-"""
 
 
 def run_quickly(*scans: Path, out: Path, prior: Path, unit: str = "m", more: Sequence[object] = ()) -> int:
     """`more2 run` with few steps."""
     settings = out.with_name("quick.yaml")
-    settings.write_text(QUICK)
+    settings.write_text(FEW_STEPS)
     options = ["--out", out, "--prior", prior, "--config", settings, "--unit", unit, *more]
     return main([str(a) for a in ("run", *scans, *options)])
 
