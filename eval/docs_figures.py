@@ -1,7 +1,7 @@
-"""Tables of the documentation, made from what runs left behind: no figure is typed.
+"""Tables and the chart of the documentation, made from what runs left behind: no figure is typed.
 
 `python -m eval.docs_figures --keep runs/e2e_cut --name real_cut` stores the figures of a run in docs/figures;
-`python -m eval.docs_figures` makes the tables of every page anew. A page says where one belongs:
+`python -m eval.docs_figures` makes the tables of every page and the README's chart anew. A page says where one belongs:
 
     <!-- figures: runs = real_cut, real_mix; show = recall, MR -->
     <!-- end of figures -->
@@ -17,6 +17,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from eval.docs_chart import draw
 from train.run.program import run
 
 DOCS = Path("docs")
@@ -40,7 +41,7 @@ OURS = "ours"  # methods whose names begin so
 
 
 def main(keep: Path | None = None, name: str = "", docs: Path = DOCS) -> None:
-    """Makes the tables of all pages anew, or stores the figures of a run.
+    """Makes the tables of all pages and the chart anew, or stores the figures of a run.
 
     Args:
         keep: folder of a run whose figures are stored; tables are not written then.
@@ -60,6 +61,7 @@ def main(keep: Path | None = None, name: str = "", docs: Path = DOCS) -> None:
         made = with_tables(text, docs / "figures")
         if made != text:
             page.write_text(made, encoding="utf-8")
+    draw(docs)
 
 
 def kept_of(results: dict[str, Any]) -> dict[str, Any]:

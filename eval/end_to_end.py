@@ -31,7 +31,7 @@ from more2_jax.network.prior import Prior
 from more2_jax.scene import add_scan, reconstruct, start_scene
 from more2_jax.types import LivingScene
 
-TEMPORAL = {"t-mAP": "t_map", "t-AP50": "t_ap50", "AP50, scans pooled": "ap50"}  # docs/evaluation.md
+TEMPORAL = {"t-mAP": "t_map", "t-AP50": "t_ap50", "AP50, scans pooled": "ap50"}  # docs/results/measures.md
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -33,7 +33,7 @@ MAIN_FIGURE = {  # of each program, the one shown by category
 }
 HEAD = """# Result tables
 
-Written by `python -m eval.report`; `docs/evaluation.md` says how to make and read them. Intervals are 95 %, by
+Written by `python -m eval.report`; `docs/guides/evaluating.md` says how to make and read them. Intervals are 95 %, by
 bootstrap over scenes; "of" is the denominator; a failure counts in it. Bold is best of its line, whoever made it.
 
 - *paper's formula*: as printed. *as published*: as the published code computes it. *strict*: rotations over the

@@ -31,7 +31,7 @@ class Demo:
     out: Path = Path("demo_scene")
     """Folder of the living scene, saved after every scan; new, empty, or a living scene to replace."""
     preset: PresetName = "robust"
-    """robust: several starts a pair. paper: as in the paper (docs/paper_map.md says what differs)."""
+    """robust: several starts a pair. paper: as in the paper (docs/concepts/paper.md says what differs)."""
     upright: bool = True
     """Objects turn about the vertical (z) only."""
     prior: str = "small"
@@ -58,7 +58,7 @@ class Run:
     out: Path
     """Folder of the living scene, saved after every scan; new, empty, or a living scene to replace."""
     preset: PresetName = "robust"
-    """robust: several starts a pair. paper: as in the paper (docs/paper_map.md says what differs)."""
+    """robust: several starts a pair. paper: as in the paper (docs/concepts/paper.md says what differs)."""
     upright: bool = False
     """Objects turn about the vertical (z) only."""
     prior: str = "small"
@@ -333,7 +333,7 @@ class Settings:
     """
 
     preset: PresetName = "robust"
-    """robust: several starts a pair. paper: as in the paper (docs/paper_map.md says what differs)."""
+    """robust: several starts a pair. paper: as in the paper (docs/concepts/paper.md says what differs)."""
 
     def __call__(self) -> int:
         print(settings_page(scene_config(self.preset, False, None)), end="")

@@ -13,7 +13,7 @@ Rows = Bool[np.ndarray, " n"]
 Cut = tuple[Rows, bool]  # one side, and whether the sides hardly touch
 
 NEIGHBOR = 6  # the distance to this one is the width of the graph's weights
-# Chosen on rooms of regime `real`, docs/relocalization.md.
+# Chosen on rooms of regime `real`, docs/developing/notebook/mask_repair.md.
 GRAPH_POINTS = 400  # of a mask, that its graph has
 NARROW = 0.003  # normalized cut: of 100 masks that hold two objects 76 have one as thin, of others 7
 

@@ -15,7 +15,7 @@ from scipy.spatial import KDTree
 
 from more2_jax.geometry.poses import Points
 
-# Chosen on rooms of regime `real`, docs/relocalization.md, "Points of something else".
+# Chosen on rooms of regime `real`, docs/developing/notebook/mask_repair.md.
 AROUND_M = 0.75  # of the cloud: what is looked at
 OFF_M = 0.025  # of a plane: what fusion, drift and a floor's waves leave
 FACING = float(np.cos(np.deg2rad(45)))  # to the plane's normal: a leg's side is no floor

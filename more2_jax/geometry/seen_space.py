@@ -12,7 +12,7 @@ from scipy.spatial import KDTree
 
 from more2_jax.geometry.poses import Points
 
-# Chosen on rooms of validation furniture (docs/relocalization.md).
+# Chosen on rooms of validation furniture (docs/developing/notebook/matching_evidence.md).
 CELL_M = 0.15  # a side of a column: scans hold a point every few centimeters
 BELOW_M = 0.05  # a point this far below a place was seen past it
 COLUMNS = 1 << 21  # a side of the grid of columns: 300 km

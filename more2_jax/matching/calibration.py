@@ -1,6 +1,6 @@
 """Log odds that two clouds show one object, from what is known of the pair: logistic regression on validation rooms.
 
-Beyond the paper (`EvidenceMatcher`). How the weights were fitted, and how well they hold, is in docs/relocalization.md;
+Beyond the paper (`EvidenceMatcher`). How the weights were fitted, and how well they hold, is in docs/developing/notebook/matching_evidence.md;
 `python -m eval.calibration` fits them anew for other weights of the prior.
 """
 
@@ -28,7 +28,7 @@ class Compared:
 
 @dataclass(frozen=True, kw_only=True)
 class Calibration:
-    """Log odds that two clouds show one object, linear in what is known of the pair (docs/relocalization.md).
+    """Log odds that two clouds show one object, linear in what is known of the pair (docs/developing/notebook/matching_evidence.md).
 
     Every piece of evidence is bounded, so that none outvotes all others where a mask is cut or dirty.
     """
@@ -52,7 +52,7 @@ HIGHEST_M = 0.05  # a mask that is cut at the top hides how high the object is
 UNKNOWN = 0.5  # of `off_own`: a prior that lays a cloud so far off its own surface has no say
 
 
-# Logistic regression on pairs of validation rooms; how, and how well it holds, is in docs/relocalization.md.
+# Logistic regression on pairs of validation rooms; how, and how well it holds, is in docs/developing/notebook/matching_evidence.md.
 UPRIGHT = Calibration(
     intercept=8.2,
     likeness=0.9,

@@ -18,7 +18,7 @@ Points = Float[np.ndarray, "n 3"]
 Values = Float[np.ndarray, " n"]
 Neighbors = tuple[Float[np.ndarray, "n k"], Int[np.ndarray, "n k"]]  # distances and indices, nearest first
 
-# The values behind the tables of docs/design_notes.md, "A surface faces who saw it"; lengths in canonical units.
+# The values behind the tables of docs/developing/notebook/mesh_sides.md; lengths in canonical units.
 STEP_RATIO, MAX_STEPS, MAX_DISTANCE = (
     1.35,
     16,

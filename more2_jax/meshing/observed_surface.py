@@ -21,8 +21,7 @@ from more2_jax.meshing.normal_orientation import outward_signs
 from more2_jax.meshing.planes import face_normals, fit_planes
 from more2_jax.meshing.screened_poisson import screened_poisson, surface_areas
 
-# The values behind the tables of docs/design_notes.md, "A surface faces who saw it" and "Exact points keep their
-# edges"; lengths in canonical units.
+# The values behind the tables of docs/developing/notebook/mesh_sides.md and mesh_edges.md; lengths in canonical units.
 PLANE_NEIGHBORS = 12  # points of a plane
 MIN_POINTS = PLANE_NEIGHBORS + 1  # fewer make no surface
 MAX_POINTS = 16_384  # more are thinned

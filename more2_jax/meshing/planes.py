@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 FACE_NEIGHBORS = (
-    6  # of a plane that is to lie in one face beside an edge (docs/design_notes.md, "Exact points")
+    6  # of a plane that is to lie in one face beside an edge (docs/developing/notebook/mesh_edges.md)
 )
 # Where the second variance is a smaller share of the first, points lie in a line, as along a scanner's, and in any
 # plane through it.

@@ -33,7 +33,7 @@ from more2_jax.types import AnyArray, pytree, quantity
 
 # The robust kernel narrows geometrically from the first width to the last, or to so many residuals of the points off
 # their own planes, whichever is more: a narrow kernel among noise hears the few points that happen to agree
-# (docs/relocalization.md, "All observations of an object at once"). Canonical units.
+# (docs/developing/notebook/pose_graph.md). Canonical units.
 FIRST_WIDTH, LAST_WIDTH = 0.05, 0.001
 WIDTH_RESIDUALS = 4.0
 CUTOFF = 4.0  # kernel widths off a plane, from where on nothing counts: much that is far off must not pull

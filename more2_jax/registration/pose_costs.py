@@ -19,7 +19,7 @@ from more2_jax.types import Embedding, Sampled, Sight
 
 Inverse = Callable[[jaxlie.SE3], jaxlie.SE3]
 
-# Chosen on validation rooms (docs/relocalization.md).
+# Chosen on validation rooms (docs/developing/notebook/registration_parts.md).
 POINT_SHARE = 0.4  # of the distance to the nearest point, in a misfit; the rest is that off its surface
 OFF_FIELD = 0.1  # canonical units: farther than this from the other's completed surface is this far
 ABOUT_AS_WELL = 0.2  # of misfit: poses that fit worse than the best by more are not the prior's to choose
@@ -82,7 +82,7 @@ def free_space_cost(
     """What it costs to lie where the other cloud's sensors looked through: of both clouds, the share that does.
 
     `surfaces` and `sights` are of source and target. Upright only: in any orientation it chose worse
-    (docs/relocalization.md).
+    (docs/developing/notebook/registration_parts.md).
     """
     cost = jnp.zeros(poses.wxyz_xyz.shape[0])
     if motion != "upright" or not search.free_weight:

@@ -15,7 +15,7 @@ from more2_jax.geometry.normalized_cut import Rows
 from more2_jax.matching.assignment import NEVER
 from more2_jax.types import Embedding
 
-# Chosen on rooms of regime `real`, docs/relocalization.md.
+# Chosen on rooms of regime `real`, docs/developing/notebook/mask_repair.md.
 SAME_SIZE = 0.8  # |log| of the ratio of the F_s: a half that differs more from every object is not compared
 # Log odds that the halves must have beyond the whole, for most masks hold one object: where the halves hardly touch,
 LEAST_GAIN_NARROW = 2.2

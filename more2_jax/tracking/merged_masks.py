@@ -32,7 +32,7 @@ from more2_jax.types import Embedding, Instance, ObservedObject, Repair, SceneOb
 
 Normals = Float[np.ndarray, "n 3"]
 
-# Chosen on rooms of regime `real`, docs/relocalization.md.
+# Chosen on rooms of regime `real`, docs/developing/notebook/mask_repair.md.
 LEAST_PART = 0.1  # share of a mask's points that either half must have
 CUTS = 2  # of a graph, that are tried
 NEIGHBORS = 7  # of a point, itself among them, that say whether it lies beside a thing

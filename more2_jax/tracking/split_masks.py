@@ -23,7 +23,7 @@ Parts = dict[
     int, tuple[int, float]
 ]  # row of a part → which of those found it is part of, share of it on that
 
-# Chosen on rooms of regime `real`, docs/relocalization.md.
+# Chosen on rooms of regime `real`, docs/developing/notebook/mask_repair.md.
 NEAR = 0.08  # shares of the object's radius: what lies so near its points lies on it
 NEAR_M = 0.03  # and at least so near: what fusion and drift leave of a surface
 LEAST_ON = 0.6  # share of a part that must lie on the whole

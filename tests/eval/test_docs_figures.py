@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from eval.docs_chart import CHART, RUNS, bars_of, draw, plain, shown_in
 from eval.docs_figures import BLOCK, FIGURES, kept_of, main, with_tables
 
 DOCS = Path(__file__).parents[2] / "docs"
@@ -79,6 +80,27 @@ def test_a_page_is_written_and_the_rest_of_it_stays(docs):
     main(docs=docs)
     text = (docs / "page.md").read_text(encoding="utf-8")
     assert text.startswith("before\n<!--") and text.count("80.0") == 2 and "old" not in text
+
+
+def test_the_chart_is_of_the_figures_that_are_kept():
+    bars = bars_of(DOCS / "figures")
+    assert bars is not None and all(len(pairs) == len(RUNS) for pairs in bars.values())
+    assert shown_in(DOCS / CHART) == plain(bars), "`python -m eval.docs_figures`"
+
+
+def test_the_chart_shows_ours_and_the_best_peer_and_is_drawn_anew_where_figures_change(tmp_path):
+    (tmp_path / "figures").mkdir()
+    rows = [{**r, "name": "instance recall"} for r in RESULTS["rows"][:3]] + RESULTS["rows"][:3]
+    for name in RUNS:
+        draw(tmp_path)
+        assert not (tmp_path / CHART).exists()
+        (tmp_path / "figures" / f"{name}.json").write_text(json.dumps({"rows": rows}), encoding="utf-8")
+    draw(tmp_path)
+    assert shown_in(tmp_path / CHART)["MR"] == [[80.0, 75.0]] * len(RUNS)
+    rows[-1]["value"] = 90.0
+    (tmp_path / "figures" / f"{name}.json").write_text(json.dumps({"rows": rows}), encoding="utf-8")
+    draw(tmp_path)
+    assert shown_in(tmp_path / CHART)["MR"][-1] == [80.0, 90.0]
 
 
 @pytest.mark.parametrize(

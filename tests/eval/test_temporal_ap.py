@@ -1,4 +1,4 @@
-"""t-mAP: values by hand, and the laws of its definition (docs/evaluation.md)."""
+"""t-mAP: values by hand, and the laws of its definition (docs/results/measures.md)."""
 
 import dataclasses
 

@@ -25,7 +25,7 @@ def jit_quickly(function, of: str, jit, **options):
 def test_the_gradient_example_gives_a_finite_gradient(monkeypatch):
     names: dict[str, object] = {"__name__": "snippet"}
     monkeypatch.setattr(jax, "jit", partial(jit_quickly, of=str(names["__name__"]), jit=jax.jit))
-    exec(snippet("docs/gradients.md"), names)
+    exec(snippet("docs/guides/gradients.md"), names)
     gradient = np.asarray(names["gradient"])
     assert np.isfinite(gradient).all()
     assert np.abs(gradient).max() > 0

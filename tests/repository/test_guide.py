@@ -1,4 +1,4 @@
-"""The pages of the guide: their Python runs, their commands parse, their links lead somewhere, the site builds."""
+"""The pages: their Python runs, their commands parse, their links lead somewhere, none is long, the site builds."""
 
 from __future__ import annotations
 
@@ -16,11 +16,17 @@ from pathlib import Path
 import jax
 import pytest
 import tyro
+from markdown.extensions.toc import slugify
 from places import ROOT
 
 from more2_jax.cli.main import Command
 
-PAGES = sorted((ROOT / "docs").rglob("*.md"))
+DOCS = ROOT / "docs"
+PAGES = sorted(DOCS.rglob("*.md"))
+AT_THE_ROOT = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")]
+MOST_WORDS = 1500  # of a page, by `wc -w`; a longer one is two pages
+WRITTEN_BY_PROGRAMS = {"reference/settings.md", "results/census.md"}
+LINK = re.compile(r"\]\(([^)\s#]*)(?:#([^)\s]*))?\)")
 BLOCK = re.compile(r"^```(\w*)\n(.*?)^```", re.DOTALL | re.MULTILINE)
 PROGRAM = re.compile(r"python -m ((?:train|eval)\.[\w.]+)")
 RUN_ELSEWHERE = {"gradients.md"}  # tests/test_docs.py runs it, and looks at the gradient
@@ -114,19 +120,40 @@ def test_a_flag_that_does_not_exist_is_noticed(parse, words, capsys):
         parse(words.split())
 
 
-@pytest.mark.parametrize(
-    "page", [p for p in PAGES if p.parent.name == "guide"] + [ROOT / "docs/index.md"], ids=named
-)
+def anchors(page: Path) -> set[str]:
+    """Of a page's headings, as the site makes them."""
+    text = BLOCK.sub("", page.read_text(encoding="utf-8"))
+    words = [re.sub(r"\[([^]]*)\]\([^)]*\)", r"\1", h) for h in re.findall(r"^#+ (.+)$", text, re.MULTILINE)]
+    return {slugify(h, "-") for h in words}
+
+
+@pytest.mark.parametrize("page", [*AT_THE_ROOT, *PAGES], ids=named)
 def test_links_lead_somewhere(page):
-    for target in re.findall(r"\]\(([^)#]+?)(?:#[^)]*)?\)", page.read_text(encoding="utf-8")):
-        assert "://" in target or (page.parent / target).exists(), target
+    for target, anchor in LINK.findall(BLOCK.sub("", page.read_text(encoding="utf-8"))):
+        if "://" in target:
+            continue
+        path = (page.parent / target).resolve() if target else page
+        assert path.exists(), target
+        assert not anchor or anchor in anchors(path), f"{target}#{anchor}"
 
 
-def test_the_guide_is_in_the_navigation():
+@pytest.mark.parametrize("page", [*AT_THE_ROOT[:2], *PAGES], ids=named)
+def test_no_page_is_long(page):
+    name = page.relative_to(DOCS).as_posix() if page.is_relative_to(DOCS) else page.name
+    words = len(page.read_text(encoding="utf-8").split())
+    assert name in WRITTEN_BY_PROGRAMS or words <= MOST_WORDS, words
+
+
+def test_every_page_is_in_the_navigation():
     navigation = (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
-    guide = [p for p in PAGES if p.parent.name == "guide"]
-    missing = [p.name for p in guide if f" {p.relative_to(ROOT / 'docs')}\n" not in navigation]
+    missing = [p.name for p in PAGES if f": {p.relative_to(DOCS).as_posix()}\n" not in navigation]
     assert missing == []
+
+
+def test_the_readme_is_short_and_shows_picture_and_chart():
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    assert len(text.splitlines()) <= 90
+    assert {"docs/pictures/before_after.png", "docs/pictures/peers.png"} <= {t for t, _ in LINK.findall(text)}
 
 
 def test_the_site_builds_strictly_and_loads_nothing_from_elsewhere(tmp_path):
@@ -139,4 +166,4 @@ def test_the_site_builds_strictly_and_loads_nothing_from_elsewhere(tmp_path):
         html = page.read_text(encoding="utf-8")
         loaded = re.findall(r"<(?:script|link|img|iframe)\b[^>]*?(?:src|href)=\"(https?:[^\"]+)\"", html)
         assert loaded == [], page.name
-    assert "add_scan" in (tmp_path / "guide" / "api.html").read_text(encoding="utf-8")
+    assert "add_scan" in (tmp_path / "reference" / "python.html").read_text(encoding="utf-8")

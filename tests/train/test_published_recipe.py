@@ -1,4 +1,4 @@
-"""`configs/paper.yaml` is the published recipe but for what docs/training.md lists, with a reason for every value."""
+"""`configs/paper.yaml` is the published recipe but for what docs/developing/paper_recipe.md lists, with a reason for every value."""
 
 import dataclasses
 import re
@@ -53,7 +53,7 @@ PUBLISHED = flat(yaml.safe_load((DATA / "published_recipe.yaml").read_text()))
 
 def listed() -> dict[str, tuple[list[object], str]]:
     """The rows of the table in the page: by setting, the published value and those of `CONFIGS`, and why."""
-    page = (ROOT / "docs" / "training.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "developing" / "paper_recipe.md").read_text(encoding="utf-8")
     section = page.split("## The paper's recipe", 1)[1].split("\n## ", 1)[0]
     rows = [
         re.split(r"\s*\|\s*", line.strip("| ")) for line in section.splitlines() if line.startswith("| `")
