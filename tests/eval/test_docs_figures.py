@@ -90,7 +90,7 @@ def test_the_chart_is_of_the_figures_that_are_kept():
 
 def test_the_chart_shows_ours_and_the_best_peer_and_is_drawn_anew_where_figures_change(tmp_path):
     (tmp_path / "figures").mkdir()
-    rows = [{**r, "name": "instance recall"} for r in RESULTS["rows"][:3]] + RESULTS["rows"][:3]
+    rows = [{**r, "name": name} for name in ("instance recall", "MR") for r in RESULTS["rows"][:3]]
     for name in RUNS:
         draw(tmp_path)
         assert not (tmp_path / CHART).exists()

@@ -30,7 +30,7 @@ LINK = re.compile(r"\]\(([^)\s#]*)(?:#([^)\s]*))?\)")
 BLOCK = re.compile(r"^```(\w*)\n(.*?)^```", re.DOTALL | re.MULTILINE)
 PROGRAM = re.compile(r"python -m ((?:train|eval)\.[\w.]+)")
 RUN_ELSEWHERE = {"gradients.md"}  # tests/test_docs.py runs it, and looks at the gradient
-SHELL_WORDS = {"python3", "pip", "source", "export", ".venv/bin/pip"}
+SHELL_WORDS = {"python3", "pip", "source", "export", "bash", ".venv/bin/pip"}
 
 
 def blocks(page: Path) -> list[tuple[str, str]]:
