@@ -27,7 +27,9 @@ def test_every_setting_has_a_meaning(name):
 
 def test_the_guide_has_the_page_of_the_default_preset():
     written = (ROOT / "docs" / "reference" / "settings.md").read_text(encoding="utf-8")
-    assert written == settings_page(preset("robust")), "`more2 settings > docs/reference/settings.md` writes it"
+    assert written == settings_page(preset("robust")), (
+        "`more2 settings > docs/reference/settings.md` writes it"
+    )
 
 
 def test_the_command_prints_it(capsys):

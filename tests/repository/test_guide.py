@@ -8,6 +8,7 @@ import io
 import os
 import re
 import shlex
+import shutil
 import subprocess
 import sys
 from contextlib import redirect_stdout
@@ -20,6 +21,8 @@ from markdown.extensions.toc import slugify
 from places import ROOT
 
 from more2_jax.cli.main import Command
+from more2_jax.scans.demo import demo_scan_paths
+from more2_jax.types import LivingScene
 
 DOCS = ROOT / "docs"
 PAGES = sorted(DOCS.rglob("*.md"))
@@ -58,6 +61,7 @@ def _compiled_once(tmp_path_factory):
 
 
 WITH_PYTHON = [p for p in PAGES if p.name not in RUN_ELSEWHERE and "python" in dict(blocks(p))]
+README = ROOT / "README.md"
 
 
 @pytest.mark.parametrize("page", WITH_PYTHON, ids=named)
@@ -77,7 +81,19 @@ def test_the_python_of_a_page_runs_and_prints_what_it_says(page, tmp_path, monke
     assert ran
 
 
-@pytest.mark.parametrize("page", [p for p in PAGES if commands(p)], ids=named)
+def test_the_python_of_the_readme_finds_the_objects_of_two_scans_again(tmp_path, monkeypatch):
+    for path in demo_scan_paths()[:2]:
+        shutil.copy(path, tmp_path)  # as scan_0.ply and scan_1.ply
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, object] = {}
+    exec(dict(blocks(README))["python"], names)
+    scene = names["scene"]
+    assert isinstance(scene, LivingScene)
+    assert len(scene.changes) == 1
+    assert len(scene.changes[0].moved) == 5
+
+
+@pytest.mark.parametrize("page", [p for p in [*AT_THE_ROOT, *PAGES] if commands(p)], ids=named)
 def test_the_commands_of_a_page_parse(page):
     for line in commands(page):
         words = shlex.split(line, comments=True)
@@ -151,7 +167,7 @@ def test_every_page_is_in_the_navigation():
 
 
 def test_the_readme_is_short_and_shows_picture_and_chart():
-    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    text = README.read_text(encoding="utf-8")
     assert len(text.splitlines()) <= 90
     assert {"docs/pictures/before_after.png", "docs/pictures/peers.png"} <= {t for t, _ in LINK.findall(text)}
 
