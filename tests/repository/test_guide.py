@@ -81,6 +81,7 @@ def test_the_python_of_a_page_runs_and_prints_what_it_says(page, tmp_path, monke
     assert ran
 
 
+@pytest.mark.slow
 def test_the_python_of_the_readme_finds_the_objects_of_two_scans_again(tmp_path, monkeypatch):
     for path in demo_scan_paths()[:2]:
         shutil.copy(path, tmp_path)  # as scan_0.ply and scan_1.ply
