@@ -61,8 +61,8 @@ class PriorConfig:
 class SurfaceSearch:
     """How a pair's poses are searched: every start aligned by coarse surfaces, the few that fit best kept.
 
-    Lengths are shares of the target cloud's radius unless a name says otherwise. docs/developing/notebook/registration_parts.md has what
-    each is worth.
+    Lengths are shares of the target cloud's radius unless a name says otherwise. What each is worth:
+    docs/developing/notebook/registration_parts.md.
     """
 
     turns: int = (
@@ -175,7 +175,8 @@ class JointConfig:
 class MeshingConfig:
     """Mesh extraction: multi-resolution iso-surface extraction (paper §3.4), drawn to observed points (not in it).
 
-    Lengths are in canonical units. The values of `robust` and what they were chosen by: docs/developing/notebook/mesh_surface.md.
+    Lengths are in canonical units. The values of `robust` and what they were chosen by:
+    docs/developing/notebook/mesh_surface.md.
     """
 
     coarse_resolution: int = 32  # cells a side of the first grid
@@ -262,7 +263,8 @@ def preset(name: str, *, upright: bool = False) -> SceneConfig:
             registration=SurfaceRegistration(),
             meshing=ROBUST_MESHING,
             pose_graph=PoseGraphConfig(steps=16),
-            # No step: after alignment by surfaces it buys neither poses nor meshes (docs/developing/notebook/design_decisions.md).
+            # No step: after alignment by surfaces it buys neither poses nor meshes
+            # (docs/developing/notebook/design_decisions.md).
             joint=JointConfig(points=128, start="accumulated", steps=0, eqv_learning_rate=1e-3),
         )
     raise ValueError(f"preset {name!r}; needed 'paper' or 'robust'")

@@ -163,7 +163,8 @@ def cache_folder() -> Path:
 def compile_sooner() -> None:
     """Has XLA leave out, on CPUs, an emitter of fused loops that costs much time and gains these programs none.
 
-    docs/developing/notebook/speed_scene.md has the figures. XLA stops at flags that it does not know: only versions that have it are told.
+    docs/developing/notebook/speed_scene.md has the figures. XLA stops at flags that it does not know: only
+    versions that have it are told.
     """
     given = os.environ.get("XLA_FLAGS", "")
     if version("jaxlib").startswith(KNOWS_EMITTERS) and EMITTERS not in given:

@@ -1,7 +1,8 @@
 """Log odds that two clouds show one object, from what is known of the pair: logistic regression on validation rooms.
 
-Beyond the paper (`EvidenceMatcher`). How the weights were fitted, and how well they hold, is in docs/developing/notebook/matching_evidence.md;
-`python -m eval.calibration` fits them anew for other weights of the prior.
+Beyond the paper (`EvidenceMatcher`). How the weights were fitted, and how well they hold, is in
+docs/developing/notebook/matching_evidence.md; `python -m eval.calibration` fits them anew for other weights of the
+prior.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ class Compared:
 
 @dataclass(frozen=True, kw_only=True)
 class Calibration:
-    """Log odds that two clouds show one object, linear in what is known of the pair (docs/developing/notebook/matching_evidence.md).
+    """Log odds that two clouds show one object, linear in what is known of the pair.
 
     Every piece of evidence is bounded, so that none outvotes all others where a mask is cut or dirty.
     """
@@ -52,7 +53,8 @@ HIGHEST_M = 0.05  # a mask that is cut at the top hides how high the object is
 UNKNOWN = 0.5  # of `off_own`: a prior that lays a cloud so far off its own surface has no say
 
 
-# Logistic regression on pairs of validation rooms; how, and how well it holds, is in docs/developing/notebook/matching_evidence.md.
+# Logistic regression on pairs of validation rooms; how, and how well it holds:
+# docs/developing/notebook/matching_evidence.md.
 UPRIGHT = Calibration(
     intercept=8.2,
     likeness=0.9,

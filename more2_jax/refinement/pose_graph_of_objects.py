@@ -26,7 +26,8 @@ from more2_jax.refinement.pose_graph import OrientedObservations, optimize_pose_
 from more2_jax.types import AccumulatedObject
 
 # Of an observation: points that planes are laid through (4,096 leave poses of exact points twice as far off, see "What
-# a mesh costs" in docs/developing/notebook/speed_scene.md), and of these the ones that are compared with the other observations'.
+# a mesh costs" in docs/developing/notebook/speed_scene.md), and of these the ones that are compared with the other
+# observations'.
 SURFACE_POINTS, COMPARED_POINTS = 8192, 1024
 MAX_OBSERVATIONS = 32  # of an object: its first, and the last of the others; more stay as registered
 MIN_OBSERVATIONS = 4  # of the padded batch: objects seen two to four times share one compiled program

@@ -34,7 +34,8 @@ from more2_jax.types import AnyArray, Embedding, LocalBatch, Sight, pytree, quan
 OBJECTS_A_CALL = 2  # prepared together
 PAIRS_A_CALL = 8  # searched together: what fits a small CPU's caches
 # In any orientation every start is aligned for a third of the steps, and the best third of them go on: as right as all
-# of them for two thirds of the work (docs/developing/notebook/speed_scene.md). Upright there are fewer, of which all have all steps.
+# of them for two thirds of the work (docs/developing/notebook/speed_scene.md). Upright there are fewer, of which all
+# have all steps.
 ROUNDS = 3
 SAME_DEG = 10.0  # of starts that have come this near to one another's rotation the best alone goes on
 

@@ -24,7 +24,8 @@ from more2_jax.types import Repair, SceneObject
 Rows = Bool[np.ndarray, " n"]
 Distances = Float[np.ndarray, " n"]
 
-# Chosen on rooms of regime `real`, docs/developing/notebook/mask_repair.md. What lies on an object: `split_masks.reach_m`.
+# Chosen on rooms of regime `real`, docs/developing/notebook/mask_repair.md. What lies on an object:
+# `split_masks.reach_m`.
 MOST_DROPPED = 0.35  # share of a mask that may be its neighbors': where more is, it is two objects in one
 LEAST_CHANGED = 0.02  # share of a mask, that is lost or comes back: fewer points are as likely wrong
 TOUCHING = 2.0  # times the spacing of its points: what lies so near a cloud goes on in it

@@ -1,4 +1,4 @@
-"""`configs/paper.yaml` is the published recipe but for what docs/developing/paper_recipe.md lists, with a reason for every value."""
+"""`configs/paper.yaml` is the published recipe but for what its page lists, with a reason for every value."""
 
 import dataclasses
 import re
