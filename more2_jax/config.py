@@ -209,7 +209,8 @@ class SceneConfig:
     """The whole method; `preset('paper')` follows the paper, `preset('robust')` is the default."""
 
     preset: str = "paper"  # whose settings these are, or began as
-    upright: bool = False  # objects turn about the vertical (z) only
+    # Objects turn about the vertical (z) only; None: where the first scan shows a level floor.
+    upright: bool | None = None
     min_points: int = 64  # objects seen with fewer are skipped, and reported
     static_deg: float = 1.0  # an object that turned by less,
     static_m: float = 0.05  # and moved by less, is static
@@ -229,7 +230,7 @@ class SceneConfig:
 
     @property
     def motion(self) -> MotionModel:
-        """How objects may move."""
+        """How objects may move; in any way while `upright` is not settled."""
         return "upright" if self.upright else "free"
 
 
@@ -247,7 +248,7 @@ ROBUST_MESHING = MeshingConfig(
 )
 
 
-def preset(name: str, *, upright: bool = False) -> SceneConfig:
+def preset(name: str, *, upright: bool | None = None) -> SceneConfig:
     """Returns the settings called `paper` or `robust`."""
     if name == "paper":
         return SceneConfig(upright=upright)

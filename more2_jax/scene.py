@@ -23,7 +23,7 @@ from more2_jax.refinement.pose_graph_of_objects import refine_object_poses
 from more2_jax.tracking.accumulated import accumulated_objects, embed_accumulated, with_refined
 from more2_jax.tracking.changes import changes_between, forgotten, not_seen_in
 from more2_jax.tracking.identify import Found, Identified, identify
-from more2_jax.tracking.leveling import as_given, level_of, leveled
+from more2_jax.tracking.leveling import as_given, level_of, leveled, shows_floor
 from more2_jax.tracking.looked_at import not_looked_at
 from more2_jax.tracking.mask_borders import mend_borders
 from more2_jax.tracking.merged_masks import Divided, divide_merged
@@ -64,6 +64,7 @@ def start_scene(
 
     `progress` is told of every stage, here and below.
     """
+    config = settled(config, shows_floor(scan) if config.upright is None else config.upright)
     level, T_level_scan = leveled_scan(scan, config)
     masks, skipped = usable(level, config)
     cleared = without_floor_and_walls(masks, level, config)
@@ -75,7 +76,7 @@ def start_scene(
     return LivingScene(
         preset=config.preset,
         prior=prior.name,
-        upright=config.upright,
+        upright=bool(config.upright),
         scans=(record(0, scan, instances, skipped, frame, repairs=cleared.repairs(0, objects)),),
         objects=tuple(objects),
         changes=(),
@@ -118,6 +119,7 @@ def add_scan(
     Objects that were absent for a while can come back. Meshes of objects seen again are dropped; `reconstruct`
     makes them anew. Raises ValueError if the scan has no usable instance.
     """
+    config = settled(config, scene.upright)
     level, T_level_scan = leveled_scan(scan, config, scene.scans[0])
     masks, skipped = usable(level, config)
     cleared = without_floor_and_walls(masks, level, config)
@@ -138,7 +140,7 @@ def add_scan(
             changed = [f.object for f, s in zip(found, seen, strict=True) if s.accumulated]
             objects = embed_accumulated(prior, objects, changed)
     missing, left = mended.left_over([(f.object, f.instance) for f in found])
-    unseen = not_looked_at(objects, missing, level, frame.T_scene_scan, config.upright)
+    unseen = not_looked_at(objects, missing, level, frame.T_scene_scan, scene.upright)
     first = next_number(objects, scene.scans)
     fresh = new_objects(first, index, left, whole.instances, [o.embedding for o in new], frame)
     chance = chances(identified, objects, fresh, config)
@@ -178,7 +180,7 @@ def reconstruct(
     (`paper`): code and poses of all objects are optimized in one call (§3.5). Observations in doubt
     (`Observation.accumulated` False) have no part in it. Objects with a mesh have not changed since and are left alone.
     """
-    timing, objects = dict(scene.timing_s), list(scene.objects)
+    config, timing, objects = settled(config, scene.upright), dict(scene.timing_s), list(scene.objects)
     todo = [k for k, o in enumerate(objects) if o.mesh is None]
     again = [k for k in todo if len(accumulated(objects[k])) > 1]
     align, fit = again if config.pose_graph.steps else [], again if config.joint.steps else []
@@ -276,6 +278,11 @@ def with_borders_mended(
     index = len(scene.scans)
     backgrounds = {s.index: s.background for s in scene.scans} | {index: scan.background}
     return mend_borders(objects, [f.object for f in found], index, backgrounds)
+
+
+def settled(config: SceneConfig, upright: bool) -> SceneConfig:
+    """The settings of a scene whose first scan has said whether things stay upright, where they leave it open."""
+    return dataclasses.replace(config, upright=upright) if config.upright is None else config
 
 
 def leveled_scan(scan: Scan, config: SceneConfig, first: ScanRecord | None = None) -> tuple[Scan, Pose]:

@@ -9,7 +9,15 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
-from tyro.conf import OmitArgPrefixes, OmitSubcommandPrefixes, Positional, arg, subcommand
+from tyro.conf import (
+    FlagCreatePairsOff,
+    OmitArgPrefixes,
+    OmitSubcommandPrefixes,
+    Positional,
+    arg,
+    create_mutex_group,
+    subcommand,
+)
 
 from more2_jax.cli import batch, places, priors, scenes
 from more2_jax.cli import living_scenes as building
@@ -18,6 +26,7 @@ from more2_jax.cli.session import one_line
 from more2_jax.cli.settings import scene_config
 from more2_jax.cli.settings_page import settings_page
 
+TURNS = create_mutex_group(required=False)
 BAD_INPUT = (ValueError, FileNotFoundError, PermissionError, IsADirectoryError, NotADirectoryError)
 
 
@@ -50,7 +59,7 @@ class Demo:
 class Run:
     """A living scene from scans in time order. One scan is reconstructed; more are compared.
 
-    Example: more2 run monday.ply friday.ply --out my_room --upright
+    Example: more2 run monday.ply friday.ply --out my_room
     """
 
     scans: Annotated[Positional[tuple[Path, ...]], arg(metavar="SCAN [SCAN ...]")]
@@ -59,8 +68,10 @@ class Run:
     """Folder of the living scene, saved after every scan; new, empty, or a living scene to replace."""
     preset: PresetName = "robust"
     """robust: several starts a pair. paper: as in the paper (docs/paper_map.md says what differs)."""
-    upright: bool = False
-    """Objects turn about the vertical (z) only."""
+    upright: Annotated[bool, TURNS, FlagCreatePairsOff] = False
+    """Objects turn about the vertical (z) only; by default where the first scan shows a level floor."""
+    any_orientation: Annotated[bool, TURNS, FlagCreatePairsOff] = False
+    """Objects turn in any way, whatever the first scan shows."""
     prior: str = "small"
     """Name of shipped weights, or a file."""
     masks: tuple[Path, ...] = ()
@@ -75,7 +86,8 @@ class Run:
     reporting: Reporting = field(default_factory=Reporting)
 
     def __call__(self) -> int:
-        config = scene_config(self.preset, self.upright, self.config, keep_masks=self.keep_masks)
+        upright = True if self.upright else False if self.any_orientation else None
+        config = scene_config(self.preset, upright, self.config, keep_masks=self.keep_masks)
         building.run_scans(
             self.scans,
             self.out,
@@ -98,7 +110,7 @@ class Batch:
 
     manifest: Positional[Path]
     """Columns: name, scans (in CSV separated by ;), and as needed out, masks, preset, upright, prior, keep_masks,
-    config, unit, instance_property, segment, depth_frames. Paths are relative to the file."""
+    config, unit, instance_property, segment, up, depth_frames. Paths are relative to the file."""
     out: Path
     """Folder of all scenes, each named after its row unless the row says out; and of the table of results."""
     workers: int | None = None

@@ -11,7 +11,7 @@ import numpy as np
 from more2_jax.scans.labeled_cloud import LabeledCloud, ReadOptions
 from more2_jax.scans.normal_sides import outward
 from more2_jax.scans.predicted_masks import lay_masks
-from more2_jax.scans.read_scan import UNITS_M, check_points, check_unit, read_cloud, scan_of, sensors_of
+from more2_jax.scans.read_scan import UNITS_M, check_axis, check_points, check_unit, read_cloud, scan_of
 from more2_jax.scans.seen_empty import UnlabeledScan
 from more2_jax.scans.temporal_segmentation import TemporalSegmentation, segment_changes
 from more2_jax.types import Scan
@@ -34,7 +34,7 @@ class _File:
 
     def unlabeled(self) -> UnlabeledScan:
         """Its points in meters, whatever instances they have."""
-        sensors = sensors_of(self.path, self.cloud)
+        sensors = np.zeros((0, 3)) if self.cloud.sensors is None else self.cloud.sensors
         normals = self.cloud.normals
         if normals is not None:
             background = np.zeros(len(normals), np.int64)
@@ -53,6 +53,7 @@ def read_changed_scans(
     min_points: int = 64,
     min_score: float = 0.5,
     depth_frames: bool = False,
+    up: str = "z",
 ) -> tuple[Scan, ...]:
     """Scans of one room, without instances, cut by what changed between them (`segment_changes`).
 
@@ -62,6 +63,7 @@ def read_changed_scans(
     left, and for what `read_scan` refuses.
     """
     check_unit(unit)
+    check_axis(up)
     every = [Path(p) for p in (*earlier, *paths)]
     if len(every) < 2 or len(masks) not in (0, len(paths)):
         raise ValueError(
@@ -72,7 +74,11 @@ def read_changed_scans(
     files = []
     for path, mask in zip(every, beside, strict=True):
         options = ReadOptions(
-            instance_property=instance_property, masks=mask, masks_needed=False, depth_frames=depth_frames
+            instance_property=instance_property,
+            masks=mask,
+            masks_needed=False,
+            depth_frames=depth_frames,
+            up=up,
         )
         cloud = read_cloud(path, options)
         cloud = cloud if mask is None else lay_masks(cloud, path, mask, min_score)

@@ -9,6 +9,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float, Integer
 
+from more2_jax.geometry.up_axis import R_UP
 from more2_jax.scans.formats.registry import FORMATS, WITH_DEPTH_FRAMES
 from more2_jax.scans.geometric_segmentation import SegmentationConfig, segment_geometric
 from more2_jax.scans.labeled_cloud import CUT_WITHOUT, LabeledCloud, ReadOptions, one_line
@@ -36,6 +37,7 @@ def read_scan(
     min_score: float = 0.5,
     segment: Literal["changes", "geometric"] | None = None,
     depth_frames: bool = False,
+    up: str = "z",
 ) -> Scan:
     """Reads one scan: instances in meters (float64, the scan's own frame), and what was left out.
 
@@ -47,18 +49,24 @@ def read_scan(
     mm. Instances of fewer than `min_points` points are reported in `Scan.skipped`; sizes that look like another
     unit, in `Scan.warnings`. `masks` are predicted ones (`data.masks`): those scored `min_score` or more replace
     the scan's own. `segment="geometric"` cuts a cloud without instances into planes and clusters; `depth_frames`
-    reads the raw depth of 3RScan (paper §4). Normals are the file's, else those of its faces.
+    reads the raw depth of 3RScan (paper §4). Normals are the file's, else those of its faces. `up` names the axis
+    that is up in the file (x, y, z, -x, -y, -z): the scan is turned so that it is z.
 
     Raises ValueError, in one line, when the file is missing, unknown, damaged, has no instance property, has
     coordinates that are not finite, or no instance is left.
     """
     path = Path(path)
     check_unit(unit)
+    check_axis(up)
     _check_alone(path, segment)
     masks = None if masks is None else Path(masks)
     needed = segment is None and masks is None
     options = ReadOptions(
-        instance_property=instance_property, masks=masks, masks_needed=needed, depth_frames=depth_frames
+        instance_property=instance_property,
+        masks=masks,
+        masks_needed=needed,
+        depth_frames=depth_frames,
+        up=up,
     )
     cloud = read_cloud(path, options)
     if masks is not None:
@@ -97,7 +105,16 @@ def _segmented(path: Path, cloud: LabeledCloud, unit: str) -> LabeledCloud:
 
 
 def read_cloud(path: Path, options: ReadOptions) -> LabeledCloud:
-    """What the first format that recognizes the path reads, in the file's unit. Raises ValueError in one line."""
+    """What the first format that recognizes the path reads, in the file's unit, and its sensors; up is z.
+
+    Raises ValueError in one line.
+    """
+    cloud = _as_filed(path, options)
+    return turned_to_z(replace(cloud, sensors=_sensors(path, cloud)), options.up)
+
+
+def _as_filed(path: Path, options: ReadOptions) -> LabeledCloud:
+    """The cloud as its format reads it."""
     if not path.exists():
         raise ValueError(f"{path}: no such file or folder")
     for form in FORMATS:
@@ -125,6 +142,25 @@ def check_unit(unit: str) -> None:
         raise ValueError(f"unit {unit!r}; needed m, cm or mm")
 
 
+def check_axis(up: str) -> None:
+    """Raises ValueError for what is no axis of `R_UP`."""
+    if up not in R_UP:
+        raise ValueError(f"up {up!r}; needed {', '.join(R_UP)}")
+
+
+def turned_to_z(cloud: LabeledCloud, up: str) -> LabeledCloud:
+    """The cloud with another of its axes as z; to the bit as it is where z is up."""
+    if up == "z":
+        return cloud
+
+    def turned(rows: Float[np.ndarray, "n 3"] | None) -> Float[np.ndarray, "n 3"] | None:
+        return None if rows is None else rows @ R_UP[up].T
+
+    return replace(
+        cloud, points=cloud.points @ R_UP[up].T, normals=turned(cloud.normals), sensors=turned(cloud.sensors)
+    )
+
+
 def check_points(path: Path, points: Float[np.ndarray, "n 3"]) -> None:
     """Raises ValueError, in one line, for no points, and for coordinates that are not finite or too large."""
     if not len(points):
@@ -149,7 +185,7 @@ def scan_of(path: Path, cloud: LabeledCloud, unit: str, min_points: int) -> Scan
         )
     check_points(path, cloud.points)
     points = cloud.points * UNITS_M[unit]
-    sensors = sensors_of(path, cloud)
+    sensors = np.zeros((0, 3)) if cloud.sensors is None else cloud.sensors
     background = points[cloud.instance <= 0]
     normals, turned = _outward_normals(cloud, cloud.instance, sensors)
     kept, skipped = _instances(replace(cloud, normals=normals), cloud.instance, points, min_points)
@@ -177,7 +213,7 @@ def _outward_normals(
     return normals, said
 
 
-def sensors_of(path: Path, cloud: LabeledCloud) -> Float[np.ndarray, "s 3"]:
+def _sensors(path: Path, cloud: LabeledCloud) -> Float[np.ndarray, "s 3"]:
     """Where the scan's sensors stood: what `<scan>.sensors.txt` beside it says, else what the scan itself says.
 
     A line a place, x y z as the scan's points. None (0 rows) where neither says. Raises ValueError, in one line,
