@@ -132,9 +132,9 @@ def registration_study(
     pairs = [p for s in scenes for p in true_pairs(s)]
     settings = {
         n.replace(f"ours, {o.preset}", "registration"): c
-        for n, c in own_settings(o.preset, config.upright).items()
+        for n, c in own_settings(o.preset, bool(config.upright)).items()
     }
-    return own_records(pairs, prior, settings, config.upright, o.batch)
+    return own_records(pairs, prior, settings, bool(config.upright), o.batch)
 
 
 def joint_study(

@@ -69,7 +69,7 @@ def prepare(options: Settings) -> tuple[Run, Work]:
     prior, config = current.prior, current.config
     both: list[Callable[[KnownScene], list[Track]]] = [
         lambda s: tracks_of(living_scene(s, prior, config)),
-        lambda s: combined(s.scans, config.upright),
+        lambda s: combined(s.scans, bool(config.upright)),
     ]
     methods = dict(zip(names, both, strict=False))
 

@@ -149,9 +149,8 @@ def add_scan(
     repairs = (*whole.repairs, *whole.masks(found, fresh), *mended.repairs)
     repairs = (*repairs, *cleared.repairs(index, objects, mended.repairs), *borders)
     scans = (*scene.scans, record(index, scan, masks, skipped, frame, unseen, repairs))
-    changes = changes_between(objects, index - 1, index, config, chance, not_seen_in(scans))
-    changed = {"scans": scans, "objects": tuple(objects), "changes": (*scene.changes, changes)}
-    return dataclasses.replace(scene, **changed, timing_s=timing)
+    changes = (*scene.changes, changes_between(objects, index - 1, index, config, chance, not_seen_in(scans)))
+    return dataclasses.replace(scene, scans=scans, objects=tuple(objects), changes=changes, timing_s=timing)
 
 
 def chances(

@@ -52,10 +52,8 @@ def run_scans(
     check_output(out)
     _check_log(reporting, out)
     with scene_lock(out), session or Session(reporting) as session:
-        session.log(
-            f"settings: preset {config.preset}, prior {prior_name}, upright "
-            f"{'as the first scan shows' if config.upright is None else config.upright}"
-        )
+        turns = "as the first scan shows" if config.upright is None else config.upright
+        session.log(f"settings: preset {config.preset}, prior {prior_name}, upright {turns}")
         scans = read_all(session, paths, config, reading, masks or [None] * len(paths))
         keep_compiled_programs()
         prior = (load or load_prior)(prior_name)

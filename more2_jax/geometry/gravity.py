@@ -31,7 +31,9 @@ LEAST_THIN = 0.5
 # above them. Levels at an end hold so much of the fullest.
 LEAST_AT_END = 0.6
 LEAST_GAIN = 1.1  # levels hold so many times what they hold along z, or up is z
-MOST_BEYOND = 0.05  # share of a scan below its floor, or above its ceiling: noise, a stair seen through a door
+MOST_BEYOND = (
+    0.05  # share of a scan below its floor, or above its ceiling: noise, a stair seen through a door
+)
 REACH_M = 50.0  # along an axis: a stray point a kilometer off must not make a million layers
 TRIED_POINTS = 5000  # at even steps, along the directions tried
 MOST_POINTS = 20_000  # at even steps, for the rest

@@ -56,24 +56,14 @@ def read_scan(
     coordinates that are not finite, or no instance is left.
     """
     path = Path(path)
-    check_unit(unit)
-    check_axis(up)
+    check_told(unit, up)
     _check_alone(path, segment)
-    masks = None if masks is None else Path(masks)
-    needed = segment is None and masks is None
+    at, needed = None if masks is None else Path(masks), segment is None and masks is None
     options = ReadOptions(
-        instance_property=instance_property,
-        masks=masks,
-        masks_needed=needed,
-        depth_frames=depth_frames,
-        up=up,
+        instance_property=instance_property, masks=at, masks_needed=needed, depth_frames=depth_frames, up=up
     )
-    cloud = read_cloud(path, options)
-    if masks is not None:
-        cloud = lay_masks(cloud, path, masks, min_score)
-    if segment is not None:
-        cloud = _segmented(path, cloud, unit)
-    return scan_of(path, cloud, unit, min_points)
+    cloud = read_masked(path, options, min_score)
+    return scan_of(path, cloud if segment is None else _segmented(path, cloud, unit), unit, min_points)
 
 
 def _check_alone(path: Path, segment: str | None) -> None:
@@ -102,6 +92,12 @@ def _segmented(path: Path, cloud: LabeledCloud, unit: str) -> LabeledCloud:
         skipped=(*cloud.skipped, *found.skipped),
         warnings=(*cloud.warnings, MASKS_ARE_BETTER, *found.sentences()),
     )
+
+
+def read_masked(path: Path, options: ReadOptions, min_score: float) -> LabeledCloud:
+    """The cloud with the predicted masks, if there are any, those scored `min_score` or more, as its instances."""
+    cloud = read_cloud(path, options)
+    return cloud if options.masks is None else lay_masks(cloud, path, options.masks, min_score)
 
 
 def read_cloud(path: Path, options: ReadOptions) -> LabeledCloud:
@@ -136,14 +132,10 @@ def _as_filed(path: Path, options: ReadOptions) -> LabeledCloud:
     raise ValueError(f"{path}: {what}; needed a .ply, an .npz, or a folder of one .ply per object")
 
 
-def check_unit(unit: str) -> None:
-    """Raises ValueError for a unit that is none of `UNITS_M`."""
+def check_told(unit: str, up: str) -> None:
+    """Raises ValueError for a unit that is none of `UNITS_M`, and for what is no axis of `R_UP`."""
     if unit not in UNITS_M:
         raise ValueError(f"unit {unit!r}; needed m, cm or mm")
-
-
-def check_axis(up: str) -> None:
-    """Raises ValueError for what is no axis of `R_UP`."""
     if up not in R_UP:
         raise ValueError(f"up {up!r}; needed {', '.join(R_UP)}")
 
