@@ -348,7 +348,7 @@ class Settings:
     """robust: several starts a pair. paper: as in the paper (docs/paper_map.md says what differs)."""
 
     def __call__(self) -> int:
-        print(settings_page(scene_config(self.preset, False, None)), end="")
+        print(settings_page(scene_config(self.preset, None, None)), end="")
         return 0
 
 
