@@ -31,9 +31,12 @@ FIGURES = {
     "t-mAP": ("t-mAP", ""),
     "t-AP50": ("t-AP50", ""),
     "median RE": ("MedRE of true pairs", "strict"),
-    "RE < 5°": ("RE < 5°", "strict"),
-    "TE < 5 cm": ("TE < 5 cm", "strict"),
+    "below 5°": ("RR, RE < 5°", "strict"),
+    "below 10°": ("RE < 10°", "strict"),
+    "median RE of pairs": ("MedRE", "strict"),
+    "within 5 cm": ("within 5 cm", "strict"),
     "time": ("time a scene", ""),
+    "time a pair": ("time a pair", ""),
 }
 SENSE = {"higher": 1.0, "lower": -1.0}
 OURS = "ours"  # methods whose names begin so

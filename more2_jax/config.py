@@ -155,7 +155,9 @@ class FieldRegistration:
     """Registration on the completed surfaces alone (beyond the paper, without ICP); lengths in shares of the radius."""
 
     method: Literal["field"] = "field"  # names these settings
-    turns: int = 24  # of the codes' rotation, about the vertical, upright; in any orientation all 60 of an icosahedron
+    turns: int = (
+        24  # of the codes' rotation, about the vertical, upright; in any orientation all 60 of an icosahedron
+    )
     search_points: int = 64  # of each cloud, asked of the other's field while all starts are aligned
     search_steps: int = 6  # of Gauss-Newton, of every start
     first_reach: float = 0.3  # a point so far off the surface counts a quarter, in the first step
@@ -172,6 +174,7 @@ Matcher = CodeMatcher | EvidenceMatcher
 RegistrationMethod = DescentRegistration | SurfaceRegistration | FieldRegistration
 # How objects move between scans: any rigid motion, or shifts and turns about the vertical (z) only.
 MotionModel = Literal["free", "upright"]
+PresetName = Literal["robust", "field", "paper"]
 
 
 @dataclass(frozen=True)

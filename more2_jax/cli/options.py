@@ -8,7 +8,6 @@ from typing import Literal
 
 Unit = Literal["m", "cm", "mm"]
 Segment = Literal["changes", "geometric"]
-PresetName = Literal["robust", "paper"]
 
 
 @dataclass(frozen=True)

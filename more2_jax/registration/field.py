@@ -28,7 +28,9 @@ from more2_jax.registration.starting_poses import place, turned_rotations
 from more2_jax.types import Registration, Sampled
 
 STILL = 1e-2  # a last step below this (radians, and shares of the radius) has settled
-LEAST_SLOPE = 0.3  # of the field, whose slope is 1 where it is a distance: a flatter one is taken as this steep
+LEAST_SLOPE = (
+    0.3  # of the field, whose slope is 1 where it is a distance: a flatter one is taken as this steep
+)
 
 
 def register_by_field(
@@ -44,7 +46,9 @@ def register_by_field(
 def _register_row(
     prior: Prior, pair: PairBatch, settings: FieldRegistration, motion: MotionModel
 ) -> Registration:
-    source, target = (sample(s.cloud.points, s.cloud.mask, settings.points) for s in (pair.source, pair.target))
+    source, target = (
+        sample(s.cloud.points, s.cloud.mask, settings.points) for s in (pair.source, pair.target)
+    )
     codes = pair.source.code, pair.target.code
     starts = pair.candidates
     if starts is None:
