@@ -168,7 +168,7 @@ def test_an_offset_is_the_field_over_its_slope(prior, clouds):
     slopes = jax.vmap(jax.grad(lambda p: meters(p[None])[0]))(points)
     length = np.linalg.norm(slopes, axis=1)
     steep = length > LEAST_SLOPE
-    assert 8 < steep.sum()
+    assert steep.sum() > 8
     np.testing.assert_allclose(distance[steep], (meters(points) / length)[steep], rtol=1e-3, atol=1e-5)
     np.testing.assert_allclose(np.linalg.norm(direction[steep], axis=1), 1, rtol=1e-3)
     np.testing.assert_allclose(direction[~steep], slopes[~steep] / LEAST_SLOPE, rtol=1e-2, atol=1e-4)
