@@ -11,7 +11,7 @@ import pieces
 import pytest
 from compiling import quick_jit
 
-from more2_jax.config import DescentRegistration, SurfaceRegistration, SurfaceSearch
+from more2_jax.config import DescentRegistration, FieldRegistration, SurfaceRegistration, SurfaceSearch
 from more2_jax.network.prior import encode
 from more2_jax.registration.pair_batch import batch_of, pair_up
 from more2_jax.registration.register_pairs import register
@@ -21,6 +21,7 @@ pytestmark = pytest.mark.quickly
 COUNT = 64
 MASK = np.ones((2, COUNT), bool)  # closed over by what is compiled
 DESCENT = DescentRegistration(points=32, sdf_points=32, steps=5, icp_steps=2)
+FIELD = FieldRegistration(search_points=16, search_steps=2, points=32, steps=3)
 SURFACE = SurfaceRegistration(
     search=SurfaceSearch(points=32, dense=64, cells=8, keep=2, steps=4),
     points=32,
@@ -96,10 +97,11 @@ def test_gradient_through_encoder_kabsch_and_refinement_agrees_with_finite_diffe
 METHODS = {
     "descent": (DESCENT, start(10.0)),
     "surface": (SURFACE, start(10.0)),
+    "field": (FIELD, start(10.0)),
     "surface without candidates": (SURFACE, None),
 }
 CASES = list(itertools.product(METHODS, ["source", "target"]))
-COMPILED = [CASES[k] for k in (0, 3, 4)]  # both clouds and every method; the others are traced, and slow
+COMPILED = [CASES[k] for k in (0, 3, 5, 6)]  # both clouds and every method; the others are traced, and slow
 
 
 def slopes_of_one(prior, clouds, method, moved):
