@@ -164,8 +164,8 @@ def test_an_offset_is_the_field_over_its_slope(prior, clouds):
     def meters(x):
         return code.scale * field_sdf(prior, field, x)
 
-    distance, direction = offsets(prior, field, points)
-    slopes = jax.vmap(jax.grad(lambda p: meters(p[None])[0]))(points)
+    distance, direction = jax.jit(offsets)(prior, field, points)
+    slopes = jax.jit(jax.vmap(jax.grad(lambda p: meters(p[None])[0])))(points)
     length = np.linalg.norm(slopes, axis=1)
     steep = length > LEAST_SLOPE
     assert steep.sum() > 8

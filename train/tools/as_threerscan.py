@@ -1,8 +1,8 @@
 """Rooms of `train.synthesize` in 3RScan's folder layout: `python -m train.tools.as_threerscan --data rooms/real`.
 
 3RScan's license keeps it from tests and examples; what reads it is proved on rooms whose truth is known. Written is
-what the benchmark reads (`eval.data.threerscan`): `3RScan.json`, and for every scan
-`labels.instances.annotated.v2.ply` and `semseg.v2.json`; beside the folder the objects' surfaces, `val_set_recon/<reference>/objectId_<id>.ply`. Frames are
+what the benchmark reads (`eval.data.threerscan`): `3RScan.json`, and for every scan its annotated mesh and
+`semseg.v2.json`; beside the folder the objects' surfaces, `val_set_recon/<reference>/objectId_<id>.ply`. Frames are
 upright and every scan's own, as the data set's are. No depth frames, no textures, no segments.
 """
 
