@@ -36,7 +36,7 @@ def rooms(tmp_path_factory):
     """A room of regime `real` and two visits, as it is synthesized and in 3RScan's layout."""
     folder = tmp_path_factory.mktemp("rooms")
     scene = real_scene(
-        list(furniture()), RealConfig(scans=2, scanned=QUICK), np.random.default_rng(1), "scene_0000"
+        list(furniture()[:5]), RealConfig(scans=2, scanned=QUICK), np.random.default_rng(1), "scene_0000"
     )
     write_real_scene(folder / "real" / "scene_0000", scene, {"seed": 1})
     as_threerscan.main(folder / "real", folder / "3rscan")
@@ -81,26 +81,51 @@ def test_true_poses_lay_scans_onto_the_surfaces(rooms):
     assert tried >= 4
 
 
+# Matching and the whole task as users run them; poses by fields, which compile sooner.
+PROGRAMS = {matching: "robust", registration: "field", reconstruction: "robust", end_to_end: "robust"}
+
+
 @pytest.mark.quickly
-@pytest.mark.parametrize(
-    "program", [matching, registration, reconstruction, end_to_end], ids=lambda p: p.__name__
-)
+@pytest.mark.parametrize("program", PROGRAMS, ids=lambda p: p.__name__)
 def test_every_program_scores_it(rooms, tmp_path, tiny_prior, program):
     save_prior(tiny_prior, tmp_path / "tiny.npz")
     known = {f.name for f in dataclasses.fields(program.Settings)}
-    more = {"samples": 500, "beside": ("field",)}
-    if program is end_to_end:  # its joint optimization alone would take longer than all else here
-        more["beside"] = ()
     options = program.Settings(
         data=rooms / "3rscan",
         out=tmp_path / "out",
         dataset="3rscan",
+        preset=PROGRAMS[program],
         prior=str(tmp_path / "tiny.npz"),
         peers=False,
-        **{k: v for k, v in more.items() if k in known},
+        **({"samples": 500} if "samples" in known else {}),
     )
     program.main(options)
     found = json.loads((tmp_path / "out" / "results.json").read_text())
     assert found["settings"]["data"]["dataset"] == "3RScan"
     counted = {r["method"] for r in found["rows"] if r["group"] == "all" and r["count"]}
-    assert {"ours, robust", *(f"ours, {p}" for p in getattr(options, "beside", ()))} <= counted
+    assert f"ours, {options.preset}" in counted
+
+
+def test_several_presets_are_scored_side_by_side(rooms, tmp_path, tiny_prior):
+    """Each once, whatever they share; codes decide in both here, so that their figures are the same."""
+    save_prior(tiny_prior, tmp_path / "tiny.npz")
+    options = matching.Settings(
+        data=rooms / "3rscan",
+        out=tmp_path / "out",
+        dataset="3rscan",
+        preset="field",
+        beside=("paper", "field"),
+        prior=str(tmp_path / "tiny.npz"),
+        peers=False,
+    )
+    assert options.presets == ("field", "paper")
+    matching.main(options)
+    rows = json.loads((tmp_path / "out" / "results.json").read_text())["rows"]
+    recall = {
+        r["method"]: r["value"] for r in rows if r["name"] == "instance recall" and r["column"] == "strict"
+    }
+    assert {"ours, field", "ours, paper"} <= set(recall) and recall["ours, field"] == recall["ours, paper"]
+    settings = registration.by_preset(("paper", "field", "robust"), upright=True)
+    names = [name for methods in settings.values() for name in methods]
+    assert len(names) == len(set(names)) and {f"ours, {p}" for p in settings} <= set(names)
+    assert settings["field"]["ours, field, without optimization"].steps == 0
