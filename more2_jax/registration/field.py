@@ -66,7 +66,8 @@ def register_pair(
     """One pair: every start aligned by few points, the best by more, the one that lies on both surfaces returned.
 
     Works in units of the target's radius. `loss` is the mean truncated distance off the completed surfaces, as a
-    share of the truncation. Differentiable.
+    share of the truncation. Differentiable, but where a ReLU of the decoder has its kink: there the field's slope, and
+    so the step, jumps. In float32 rounding crosses such kinks: gradients through many steps want float64.
     """
     radius = cloud_radius(pair.target.points, pair.target.mask)
     pair = rescale(pair, 1 / radius)
