@@ -36,7 +36,7 @@ def rooms(tmp_path_factory):
     """A room of regime `real` and two visits, as it is synthesized and in 3RScan's layout."""
     folder = tmp_path_factory.mktemp("rooms")
     scene = real_scene(
-        list(furniture()[:5]), RealConfig(scans=2, scanned=QUICK), np.random.default_rng(1), "scene_0000"
+        list(furniture()[:7]), RealConfig(scans=2, scanned=QUICK), np.random.default_rng(1), "scene_0000"
     )
     write_real_scene(folder / "real" / "scene_0000", scene, {"seed": 1})
     as_threerscan.main(folder / "real", folder / "3rscan")
