@@ -18,7 +18,7 @@ import jax
 import tyro
 
 from eval.data.truth import KnownScene
-from eval.harness.options import Options
+from eval.harness.options import OptionsBeside
 from eval.harness.program import Program, Summary, carry_out, run_program
 from eval.harness.runs import Run, Work, open_run
 from eval.peers.end_to_end import NAME, combined
@@ -26,7 +26,7 @@ from eval.scores.divided_masks import with_divided_masks
 from eval.scores.figures import Figure, Record, in_columns
 from eval.scores.temporal_ap import temporal_records
 from eval.scores.tracks import Track, changes_f1, score_tracks, tracks_of
-from more2_jax.config import SceneConfig
+from more2_jax.config import SceneConfig, preset
 from more2_jax.network.prior import Prior
 from more2_jax.scene import add_scan, reconstruct, start_scene
 from more2_jax.types import LivingScene
@@ -35,7 +35,7 @@ TEMPORAL = {"t-mAP": "t_map", "t-AP50": "t_ap50", "AP50, scans pooled": "ap50"} 
 
 
 @dataclass(frozen=True, kw_only=True)
-class Settings(Options):
+class Settings(OptionsBeside):
     """Which data, which settings, and where results go."""
 
     samples: int = 20_000
@@ -64,14 +64,15 @@ def main(options: Annotated[Settings, tyro.conf.arg(name="")]) -> None:
 
 def prepare(options: Settings) -> tuple[Run, Work]:
     """The run, and what is done with its scenes."""
-    names = [f"ours, {options.preset}", *([NAME] if options.peers else [])]
+    names = [*(f"ours, {p}" for p in options.presets), *([NAME] if options.peers else [])]
     current = open_run("end_to_end", options, {"methods": names, "samples": options.samples})
-    prior, config = current.prior, current.config
-    both: list[Callable[[KnownScene], list[Track]]] = [
-        lambda s: tracks_of(living_scene(s, prior, config)),
-        lambda s: combined(s.scans, bool(config.upright)),
-    ]
-    methods = dict(zip(names, both, strict=False))
+    prior, upright = current.prior, current.config.upright
+    methods: dict[str, Callable[[KnownScene], list[Track]]] = {}
+    for name in options.presets:
+        config = preset(name, upright=upright)
+        methods[f"ours, {name}"] = lambda s, c=config: tracks_of(living_scene(s, prior, c))
+    if options.peers:
+        methods[NAME] = lambda s: combined(s.scans, bool(upright))
 
     def one(scene: KnownScene) -> list[Record]:
         return [

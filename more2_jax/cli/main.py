@@ -21,10 +21,11 @@ from tyro.conf import (
 
 from more2_jax.cli import batch, places, priors, scenes
 from more2_jax.cli import living_scenes as building
-from more2_jax.cli.options import PresetName, Reading, Reporting
+from more2_jax.cli.options import Reading, Reporting
 from more2_jax.cli.session import one_line
 from more2_jax.cli.settings import scene_config
 from more2_jax.cli.settings_page import settings_page
+from more2_jax.config import PresetName
 
 TURNS = create_mutex_group(required=False)
 BAD_INPUT = (ValueError, FileNotFoundError, PermissionError, IsADirectoryError, NotADirectoryError)
@@ -40,7 +41,8 @@ class Demo:
     out: Path = Path("demo_scene")
     """Folder of the living scene, saved after every scan; new, empty, or a living scene to replace."""
     preset: PresetName = "robust"
-    """robust: several starts a pair. paper: as in the paper (docs/paper_map.md says what differs)."""
+    """robust: several starts a pair. field: poses by completed shapes alone (docs/field.md). paper: as in the paper
+    (docs/paper_map.md says what differs)."""
     upright: bool = True
     """Objects turn about the vertical (z) only."""
     prior: str = "small"
@@ -67,7 +69,8 @@ class Run:
     out: Path
     """Folder of the living scene, saved after every scan; new, empty, or a living scene to replace."""
     preset: PresetName = "robust"
-    """robust: several starts a pair. paper: as in the paper (docs/paper_map.md says what differs)."""
+    """robust: several starts a pair. field: poses by completed shapes alone (docs/field.md). paper: as in the paper
+    (docs/paper_map.md says what differs)."""
     upright: Annotated[bool, TURNS, FlagCreatePairsOff] = False
     """Objects turn about the vertical (z) only; by default where the first scan shows a level floor."""
     any_orientation: Annotated[bool, TURNS, FlagCreatePairsOff] = False
@@ -345,7 +348,8 @@ class Settings:
     """
 
     preset: PresetName = "robust"
-    """robust: several starts a pair. paper: as in the paper (docs/paper_map.md says what differs)."""
+    """robust: several starts a pair. field: poses by completed shapes alone (docs/field.md). paper: as in the paper
+    (docs/paper_map.md says what differs)."""
 
     def __call__(self) -> int:
         print(settings_page(scene_config(self.preset, None, None)), end="")

@@ -9,10 +9,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, get_args
 
-from more2_jax.cli.options import Axis, PresetName, Reading, Segment, Unit
+from more2_jax.cli.options import Axis, Reading, Segment, Unit
 from more2_jax.cli.settings import scene_config
 from more2_jax.cli.tables import needs_parquet
-from more2_jax.config import SceneConfig
+from more2_jax.config import PresetName, SceneConfig
 
 SEPARATOR = ";"  # between the scans of a cell of CSV
 YES, NO = ("true", "yes", "1"), ("false", "no", "0")

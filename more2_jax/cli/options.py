@@ -9,7 +9,6 @@ from typing import Literal
 Unit = Literal["m", "cm", "mm"]
 Segment = Literal["changes", "geometric"]
 Axis = Literal["x", "y", "z", "-x", "-y", "-z"]
-PresetName = Literal["robust", "paper"]
 
 
 @dataclass(frozen=True)
