@@ -199,7 +199,7 @@ def test_the_cells_of_a_row_are_the_options_of_run(place, tiny):
 @pytest.mark.parametrize(
     ("cells", "says"),
     [
-        ("x,a.ply,sideways,,", "got 'sideways'; needed one of robust, paper"),
+        ("x,a.ply,sideways,,", "got 'sideways'; needed one of robust, field, paper"),
         ("x,a.ply,,maybe,", "got 'maybe'; needed true or false"),
         ("x,,,,", "no scans; needed one"),
         (",a.ply,,,", "no name; needed one"),
