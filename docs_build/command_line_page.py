@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import os
 import re
-from contextlib import redirect_stdout
+from contextlib import redirect_stdout, suppress
 from unittest.mock import patch
 
 from more2_jax.cli.main import main
@@ -41,9 +41,7 @@ def section(words: list[str]) -> str:
 def help_of(words: list[str]) -> str:
     """What a command prints when it is asked for help, without colors."""
     printed = io.StringIO()
-    with patch.dict(os.environ, {"COLUMNS": str(WIDTH), "NO_COLOR": "1"}), redirect_stdout(printed):
-        try:
-            main([*words, "--help"])
-        except SystemExit:  # help ends the process
-            pass
+    plain = patch.dict(os.environ, {"COLUMNS": str(WIDTH), "NO_COLOR": "1"})
+    with plain, redirect_stdout(printed), suppress(SystemExit):  # with which help ends
+        main([*words, "--help"])
     return "\n".join(line.rstrip() for line in printed.getvalue().splitlines()).strip()

@@ -8,8 +8,8 @@ import more2_jax
 
 HEAD = """# Python
 
-`import more2_jax as m2` has these names. Lengths are in meters, angles in radians unless a name ends in `_deg`. `T_a_b` takes
-points of frame b to frame a. Points are rows, (n, 3).
+`import more2_jax as m2` has these names. Lengths are in meters, angles in radians unless a name ends in `_deg`. `T_a_b`
+takes points of frame b to frame a. Points are rows, (n, 3).
 
 """
 # In the order of use; a module that is not named stands at the end under its own name.
@@ -36,7 +36,9 @@ def python_page() -> str:
         part = path.split(".")[1]
         sections.setdefault(TITLES.get(part, part), []).append(path)
     return HEAD + "\n".join(
-        f"## {title}\n" + "".join(f"::: {path}\n" for path in paths) for title, paths in sections.items() if paths
+        f"## {title}\n" + "".join(f"::: {path}\n" for path in paths)
+        for title, paths in sections.items()
+        if paths
     )
 
 

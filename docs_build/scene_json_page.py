@@ -9,9 +9,9 @@ from typing import Any
 ASSETS = Path(__file__).parents[1] / "more2_jax" / "assets"
 HEAD = """# scene.json
 
-What the folder of a living scene says of it in `scene.json`. Lengths are in meters and angles in degrees. A pose `T_a_b` is a
-4×4 matrix, row by row, that takes points of frame b to frame a. The JSON Schema is in the package:
-`more2_jax/assets/scene.schema.json`; what is stored keeps to it.
+What the folder of a living scene says of it in `scene.json`. Lengths are in meters and angles in degrees. A pose
+`T_a_b` is a 4×4 matrix, row by row, that takes points of frame b to frame a. What is stored keeps to the JSON Schema
+in the package, `more2_jax/assets/scene.schema.json`.
 
 """
 LOG = """
@@ -47,10 +47,10 @@ def tables(whole: dict[str, Any]) -> str:
 def table(record: dict[str, Any]) -> str:
     """The keys of one record."""
     needed = set(record.get("required", ()))
-    rows = [
-        f"| `{key}` | {kind(value)} | {'always' if key in needed else 'where there is any'} | {value.get('description', '')} |"
-        for key, value in record["properties"].items()
-    ]
+    rows = []
+    for key, value in record["properties"].items():
+        present = "always" if key in needed else "where there is any"
+        rows.append(f"| `{key}` | {kind(value)} | {present} | {value.get('description', '')} |")
     return "\n".join(["| key | is | present | means |", "|---|---|---|---|", *rows, ""])
 
 
@@ -67,7 +67,9 @@ def kind(value: dict[str, Any]) -> str:
         return " or ".join(kind(v) for v in value["oneOf"])
     kinds = value.get("type", "any")
     if kinds == "array":
-        length = f"{value['minItems']} × " if value.get("minItems") == value.get("maxItems", -1) else "list of "
+        length = (
+            f"{value['minItems']} × " if value.get("minItems") == value.get("maxItems", -1) else "list of "
+        )
         return length + kind(value["items"])
     if kinds == "object" and isinstance(value.get("additionalProperties"), dict):
         keys = kind(value["propertyNames"]) if "propertyNames" in value else "string"

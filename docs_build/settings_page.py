@@ -1,4 +1,4 @@
-"""docs/reference/settings.md: every settings class with its fields, defaults and meanings, both presets side by side."""
+"""docs/reference/settings.md: every settings class, with defaults and meanings, both presets side by side."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from train.run.settings import TrainingConfig
 
 HEAD = """# Settings
 
-Every setting with its value in the presets `paper` and `robust`, and what it means. From Python: `m2.preset("robust")` and
-`dataclasses.replace`. On the command line: `--preset`, and `--config` with a YAML file that replaces values by these names.
-`more2 settings --preset robust` prints those of one preset.
+Every setting with its value in the presets `paper` and `robust`, and what it means. From Python, `m2.preset("robust")`
+gives them and `dataclasses.replace` changes them. On the command line, `--config` names a YAML file that replaces
+values. `more2 settings --preset robust` prints those of one preset.
 
 ```yaml
 static_m: 0.1
@@ -52,7 +52,9 @@ def scene_sections(settings: type, where: str, values: dict[str, Any]) -> Iterat
             inner += [(c, name, held) for c in classes]
             continue
         shown = (code(held[p]) if p in held else ABSENT for p in values)
-        rows.append(f"| `{name}` | {type_of(hints[f.name])} | {' | '.join(shown)} | {escaped(meanings[f.name])} |")
+        rows.append(
+            f"| `{name}` | {type_of(hints[f.name])} | {' | '.join(shown)} | {escaped(meanings[f.name])} |"
+        )
     users = [p for p, v in values.items() if isinstance(v, settings)]
     yield heading(settings, where, "" if len(users) == len(values) else f" Used by `{'`, `'.join(users)}`.")
     yield "\n".join(["| setting | type | paper | robust | meaning |", "|---|---|---|---|---|", *rows, ""])
@@ -70,7 +72,9 @@ def default_sections(settings: type, where: str) -> Iterator[str]:
             inner.append((hints[f.name], f"{where}.{f.name}"))
             continue
         value = code(getattr(default, f.name))
-        rows.append(f"| `{where}.{f.name}` | {type_of(hints[f.name])} | {value} | {escaped(meanings[f.name])} |")
+        rows.append(
+            f"| `{where}.{f.name}` | {type_of(hints[f.name])} | {value} | {escaped(meanings[f.name])} |"
+        )
     yield heading(settings, where, "")
     if rows:
         yield "\n".join(["| setting | type | default | meaning |", "|---|---|---|---|", *rows, ""])

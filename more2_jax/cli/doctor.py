@@ -35,7 +35,9 @@ class Diagnosis:
     devices: tuple[str, ...]
     cache: str  # where compiled programs are kept
     cache_writable: bool
-    extras: dict[str, dict[str, str | None]]  # by extra: version of each of its packages, None where it is missing
+    extras: dict[
+        str, dict[str, str | None]
+    ]  # by extra: version of each of its packages, None where it is missing
     free_memory_mb: int | None  # of the host; None where the system does not say
     self_test: SelfTest | None  # None where it failed
     problems: tuple[str, ...]  # in one line each; none: it works
@@ -61,7 +63,9 @@ def diagnose() -> Diagnosis:
     cache = str(jax.config.values["jax_compilation_cache_dir"])
     writable = is_writable(cache)
     if not writable:
-        problems.append(f"cache {cache} cannot be written: every command compiles anew; MORE2_CACHE names another")
+        problems.append(
+            f"cache {cache} cannot be written: every command compiles anew; MORE2_CACHE names another"
+        )
     tested = None
     try:
         tested = self_test()
@@ -85,7 +89,7 @@ def diagnose() -> Diagnosis:
 
 
 def is_writable(folder: str) -> bool:
-    """Whether files can be made in a folder, which is made where it is missing; of addresses (gs://…) nothing is known."""
+    """Whether files can be made in a folder, which is made where it is missing; addresses (gs://…) are not tried."""
     if "://" in folder:
         return True
     try:
@@ -109,7 +113,11 @@ def extras() -> dict[str, dict[str, str | None]]:
 
 def packages_of(extra: str, needs: list[Requirement]) -> list[str]:
     """The packages that an extra adds, those of the extras that it names included."""
-    own = [r for r in needs if r.marker and r.marker.evaluate({"extra": extra}) and not r.marker.evaluate({"extra": ""})]
+    own = [
+        r
+        for r in needs
+        if r.marker and r.marker.evaluate({"extra": extra}) and not r.marker.evaluate({"extra": ""})
+    ]
     names = []
     for need in own:
         if canonicalize_name(need.name) == PACKAGE:
@@ -163,4 +171,8 @@ def told(found: Diagnosis) -> list[str]:
             f"{test.equivariance:.0e}, a known pose to {test.rotation_error_deg:.1f}° and "
             f"{100 * test.position_error_m:.1f} cm"
         )
-    return [*lines, *(f"problem    {text}" for text in found.problems), "all is well" if not found.problems else "not well"]
+    return [
+        *lines,
+        *(f"problem    {text}" for text in found.problems),
+        "all is well" if not found.problems else "not well",
+    ]

@@ -10,7 +10,9 @@ import numpy as np
 # Single precision gives 1e-6 (tests/network/test_shipped.py); matrix units that round inputs to ten bits, 1e-2.
 MOST_DEVIATION = 1e-3
 MOST_ROTATION_DEG, MOST_POSITION_M = 5.0, 0.05  # ten times what the pair below gives
-OBJECTS = 3  # of the first bundled scan: rounding may decide a neighbor in one cloud of twenty, the median holds
+OBJECTS = (
+    3  # of the first bundled scan: rounding may decide a neighbor in one cloud of twenty, the median holds
+)
 TURN_DEG, SHIFT_M = 70.0, (1.5, -0.4, 0.0)  # of the chair, between before and after
 CHAIR = 5  # its instance
 

@@ -36,7 +36,8 @@ def test_it_says_what_is_there(healthy, capsys):
 
 def test_extras_name_their_packages_and_what_is_missing(monkeypatch):
     needs = (
-        'trimesh>=4\nRequires-Dist: embreex>=4.4; extra == "data"\nRequires-Dist: no-such-thing[x]>=1; extra == "data"\n'
+        'trimesh>=4\nRequires-Dist: embreex>=4.4; extra == "data"\n'
+        'Requires-Dist: no-such-thing[x]>=1; extra == "data"\n'
         'Requires-Dist: more2-jax[data]; extra == "train"\nRequires-Dist: numpy>=2; extra == "train"\n'
         'Requires-Dist: pytest; extra == "dev"'
     )

@@ -33,9 +33,20 @@ def printed(tmp_path_factory):
             timeout=LIMIT_S,
         )
         assert done.returncode == 0, done.stderr[-2000:]
+        assert words(done.stdout) == words(kept_output(path)), "python -m docs_build.examples"
         return done.stdout
 
     return run
+
+
+def kept_output(path) -> str:
+    """What the page of an example says that it prints."""
+    return (path.parent / "outputs" / f"{path.stem}.txt").read_text(encoding="utf-8")
+
+
+def words(text: str) -> list[str]:
+    """The text without its figures, which differ in the last digits from machine to machine."""
+    return re.sub(r"-?\d[\d.,]*(?:e[-+]?\d+)?", "#", text).replace("[", " ").replace("]", " ").split()
 
 
 def number_after(words: str, text: str) -> float:
