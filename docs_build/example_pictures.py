@@ -29,7 +29,7 @@ def top_view(axes: Any, points: np.ndarray, color: Any, label: str | None = None
 
 def two_clouds(names: Names) -> Figure:
     """Before and after, and the first laid onto the second by the pose that was found."""
-    figure, (left, right) = plt.subplots(1, 2, figsize=(8, 3.4), layout="constrained", sharey=True)
+    figure, (left, right) = plt.subplots(1, 2, figsize=(8, 3.4), layout="constrained")
     before, after, T = names["before"], names["after"], names["T"]
     moved = before @ T[:3, :3].T + T[:3, 3]
     top_view(left, before, BEFORE, "before")
@@ -38,6 +38,7 @@ def two_clouds(names: Names) -> Figure:
     top_view(right, moved, FOUND, "before, by the pose found")
     for axes in (left, right):
         axes.legend(fontsize=7, markerscale=4)
+        axes.margins(0.25)
         axes.set_xlabel("x, m")
     return figure
 
@@ -65,12 +66,13 @@ def later_scan(names: Names) -> Figure:
 
 
 def gradient_of_points(names: Names) -> Figure:
-    """The cloud from above, with the gradient of the loss at every point."""
+    """The cloud from above, colored by how much the loss depends on each point."""
     figure, axes = plt.subplots(figsize=(5, 3.4), layout="constrained")
     cloud, gradient = np.asarray(names["cloud"]), np.asarray(names["gradient"])
-    top_view(axes, cloud, BEFORE, size=8)
-    axes.quiver(cloud[:, 0], cloud[:, 1], -gradient[:, 0], -gradient[:, 1], color=FOUND, width=0.003)
-    axes.set_title("where the loss falls, at every point", fontsize=9)
+    slope = np.log10(np.linalg.norm(gradient, axis=1))
+    shown = axes.scatter(cloud[:, 0], cloud[:, 1], c=slope, s=14, cmap="viridis")
+    axes.set_aspect("equal")
+    figure.colorbar(shown, label="log10 of the gradient at the point")
     return figure
 
 

@@ -75,18 +75,15 @@ def test_a_chair_is_found_again(printed):
     assert "converged: True" in text
 
 
-@pytest.mark.slow
 def test_a_scene_in_few_lines_names_what_came_and_went(printed):
     text = printed(2)
     assert "scan 0 to 1: 5 moved, 1 static, added object_007, removed object_003" in text
 
 
-@pytest.mark.slow
 def test_the_gradient_agrees_with_finite_differences(printed):
     assert number_after("relative difference:", printed(3)) < 1e-3
 
 
-@pytest.mark.slow
 def test_a_hundred_pairs_are_registered(printed):
     assert number_after("share below 5°:", printed(4)) > 0.7
 
@@ -102,14 +99,12 @@ def test_a_mesh_from_one_view_is_closed_and_its_verdict_follows_from_its_figures
     )  # centimeters: around the chair, if not its shape
 
 
-@pytest.mark.slow
 def test_a_later_scan_changes_no_earlier_pose(printed):
     text = printed(6)
     assert "found again: 7 of 7" in text
     assert "earlier poses unchanged: yes" in text
 
 
-@pytest.mark.slow
 def test_another_encoder_takes_the_place(printed):
     text = printed(7)
     assert number_after("matched by the own descriptor alone:", text) >= 4
