@@ -5,8 +5,6 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass
 
-import numpy as np
-
 # Single precision gives 1e-6 (tests/network/test_shipped.py); matrix units that round inputs to ten bits, 1e-2.
 MOST_DEVIATION = 1e-3
 MOST_ROTATION_DEG, MOST_POSITION_M = 5.0, 0.05  # ten times what the pair below gives
@@ -38,6 +36,7 @@ class SelfTest:
 
 def self_test() -> SelfTest:
     """Encodes objects as scanned and turned, and registers a chair with itself moved, other points of it."""
+    import numpy as np
     from scipy.spatial.transform import Rotation
 
     import more2_jax as m2
