@@ -69,10 +69,14 @@ def gradient_of_points(names: Names) -> Figure:
     """The cloud from above, colored by how much the loss depends on each point."""
     figure, axes = plt.subplots(figsize=(5, 3.4), layout="constrained")
     cloud, gradient = np.asarray(names["cloud"]), np.asarray(names["gradient"])
-    slope = np.log10(np.linalg.norm(gradient, axis=1))
-    shown = axes.scatter(cloud[:, 0], cloud[:, 1], c=slope, s=14, cmap="viridis")
-    axes.set_aspect("equal")
-    figure.colorbar(shown, label="log10 of the gradient at the point")
+    slope = np.linalg.norm(gradient, axis=1)
+    used = (
+        slope > 1e-6 * slope.max()
+    )  # registration looks at some of the points, the encoder at their neighbors
+    top_view(axes, cloud[~used], BEFORE, "no part in the loss", 8)
+    shown = axes.scatter(*cloud[used, :2].T, c=np.log10(slope[used]), s=14, cmap="viridis")
+    axes.legend(fontsize=7, loc="lower left")
+    figure.colorbar(shown, label="log10 of the gradient at a point", shrink=0.7)
     return figure
 
 

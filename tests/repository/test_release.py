@@ -52,7 +52,9 @@ def installed(built, tmp_path_factory) -> Path:
     install = [sys.executable, "-m", "pip", "--python", programs / "python", "install", "--quiet"]
     subprocess.run([*install, "--no-deps", "--no-index", built[".whl"]], check=True, timeout=120)
     (site,) = folder.glob("lib/python*/site-packages")
-    (site / "dependencies.pth").write_text("\n".join(p for p in sys.path if p.endswith("site-packages")) + "\n")
+    (site / "dependencies.pth").write_text(
+        "\n".join(p for p in sys.path if p.endswith("site-packages")) + "\n"
+    )
     return programs
 
 
