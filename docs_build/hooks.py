@@ -24,13 +24,24 @@ def on_config(config: MkDocsConfig) -> MkDocsConfig:
     examples = [path for path in pages if path.startswith("examples/") and path.endswith(".md")]
     for title, entries in (("Reference", reference), ("Examples", [p for p in examples if p not in named])):
         if entries and config.nav is not None:
-            config.nav.append({title: entries})
+            section_of(config.nav, title).extend(entries)
     return config
 
 
+def section_of(nav: list[Any], title: str) -> list[Any]:
+    """The entries of a section of the navigation, which is made at its end where there is none."""
+    for entry in nav:
+        if isinstance(entry, dict) and title in entry:
+            return entry[title]
+    nav.append({title: []})
+    return nav[-1][title]
+
+
 def on_files(files: Files, config: MkDocsConfig) -> Files:
-    """Adds the pages and their pictures."""
+    """Adds the pages and their pictures, in place of files of their names."""
     for path, content in generated_pages_or_stop().items():
+        if (typed := files.get_file_from_path(path)) is not None:
+            files.remove(typed)
         files.append(File.generated(config, path, content=content))
     return files
 

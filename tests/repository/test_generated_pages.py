@@ -11,7 +11,7 @@ import more2_jax
 from docs_build import examples
 from docs_build.command_line_page import command_line_page
 from docs_build.examples import all_examples, example_pages, stale_examples
-from docs_build.hooks import pages_in
+from docs_build.hooks import pages_in, section_of
 from docs_build.python_page import python_page
 from docs_build.scene_json_page import scene_json_page, schema, table
 from docs_build.settings_page import settings_reference
@@ -144,3 +144,10 @@ def test_a_changed_example_is_refused_until_it_was_run(monkeypatch, tmp_path):
 
 def test_pages_of_a_navigation_are_found_at_any_depth():
     assert pages_in([{"A": [{"B": "b.md"}, "c.md"]}, {"D": "d.md"}]) == ["b.md", "c.md", "d.md"]
+
+
+def test_a_section_of_the_navigation_is_found_or_made():
+    nav = [{"Reference": ["a.md"]}]
+    section_of(nav, "Reference").append("b.md")
+    section_of(nav, "Examples").append("c.md")
+    assert nav == [{"Reference": ["a.md", "b.md"]}, {"Examples": ["c.md"]}]
