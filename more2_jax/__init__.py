@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from more2_jax import renamed
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 # Public names and where they live. Imported on first use: `more2 --help` need not wait for JAX.
 _HOMES = {

@@ -12,16 +12,17 @@ import tyro
 from tyro.conf import (
     FlagCreatePairsOff,
     OmitArgPrefixes,
-    OmitSubcommandPrefixes,
     Positional,
     arg,
     create_mutex_group,
     subcommand,
 )
 
-from more2_jax.cli import batch, places, priors, scenes
+from more2_jax import __version__
+from more2_jax.cli import batch, doctor, places, scenes
 from more2_jax.cli import living_scenes as building
 from more2_jax.cli.options import Reading, Reporting
+from more2_jax.cli.prior_commands import PriorCommand
 from more2_jax.cli.session import one_line
 from more2_jax.cli.settings import scene_config
 from more2_jax.cli.settings_page import settings_page
@@ -263,84 +264,6 @@ class Find:
 
 
 @dataclass(frozen=True)
-class PriorList:
-    """The weights inside the package.
-
-    Example: more2 prior list
-    """
-
-    def __call__(self) -> int:
-        priors.list_shipped()
-        return 0
-
-
-@dataclass(frozen=True)
-class PriorInfo:
-    """What a weight file holds.
-
-    Example: more2 prior info small
-    """
-
-    name: Positional[str]
-    """Name of shipped weights, or a file."""
-
-    def __call__(self) -> int:
-        priors.info(self.name)
-        return 0
-
-
-@dataclass(frozen=True)
-class PriorImport:
-    """The published PyTorch checkpoint converted, in full precision; runs no code from the file.
-
-    Example: more2 prior import published.pt published.npz
-    """
-
-    checkpoint: Positional[Path]
-    """A checkpoint with the published names under model_state_dict."""
-    out: Positional[Path]
-    """The weight file to write; a new .npz."""
-
-    def __call__(self) -> int:
-        priors.import_published(self.checkpoint, self.out)
-        return 0
-
-
-@dataclass(frozen=True)
-class PriorCheck:
-    """Largest deviations of converted weights from a reference's outputs; exit 0 only if all are below 1e-5.
-
-    Example: more2 prior check published.pt reference.npz
-    """
-
-    checkpoint: Positional[Path]
-    """A checkpoint; or, alone, a reference that holds the weights too."""
-    reference: Positional[Path | None] = None
-    """NPZ of points, queries, F_inv, F_eqv, F_s, F_c and sdf."""
-
-    def __call__(self) -> int:
-        return priors.check(self.checkpoint, self.reference)
-
-
-@dataclass(frozen=True)
-class PriorCommand:
-    """Weights: shipped, the published checkpoint converted, your own.
-
-    Example: more2 prior list
-    """
-
-    action: OmitSubcommandPrefixes[
-        Annotated[PriorList, subcommand("list")]
-        | Annotated[PriorInfo, subcommand("info")]
-        | Annotated[PriorImport, subcommand("import")]
-        | Annotated[PriorCheck, subcommand("check")]
-    ]
-
-    def __call__(self) -> int:
-        return self.action()
-
-
-@dataclass(frozen=True)
 class Settings:
     """Every setting of a preset on one page, as Markdown: name, value, meaning.
 
@@ -356,6 +279,35 @@ class Settings:
         return 0
 
 
+@dataclass(frozen=True)
+class Doctor:
+    """Whether this installation works: versions, devices, cache, extras, memory, and a short test of the method.
+
+    Example: more2 doctor --json
+    """
+
+    json: bool = False
+    """Print one JSON object."""
+
+    def __call__(self) -> int:
+        return doctor.doctor(as_json=self.json)
+
+
+@dataclass(frozen=True)
+class Completion:
+    """A script that completes commands and flags in a shell; goes to standard output.
+
+    Example: more2 completion bash
+    """
+
+    shell: Positional[Literal["bash", "zsh", "fish"]]
+    """The shell that reads it, as in `eval "$(more2 completion bash)"`."""
+
+    def __call__(self) -> int:
+        parsed(["--tyro-write-completion", self.shell, "-"])  # prints it and ends the process
+        return 0
+
+
 Command = (
     Annotated[Demo, subcommand("demo")]
     | Annotated[Run, subcommand("run")]
@@ -368,18 +320,29 @@ Command = (
     | Annotated[Find, subcommand("find")]
     | Annotated[Settings, subcommand("settings")]
     | Annotated[PriorCommand, subcommand("prior")]
+    | Annotated[Doctor, subcommand("doctor")]
+    | Annotated[Completion, subcommand("completion")]
 )
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Runs one command; returns the exit code. Unforeseen exceptions pass through, with their traceback."""
-    command = tyro.cli(
+def parsed(argv: Sequence[str] | None) -> Command:
+    """The command that the words name; ends the process where they ask for help or do not fit."""
+    return tyro.cli(
         Command,  # type: ignore[arg-type]
         args=argv,
         prog="more2",
         description="Living scenes: objects found again and reconstructed over scans of one place.",
         config=(OmitArgPrefixes,),
     )
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Runs one command; returns the exit code. Unforeseen exceptions pass through, with their traceback."""
+    words = sys.argv[1:] if argv is None else list(argv)
+    if words == ["--version"]:
+        print(f"more2 {__version__}")
+        return 0
+    command = parsed(words)
     try:
         return command()
     except BAD_INPUT as error:
