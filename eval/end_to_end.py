@@ -28,6 +28,7 @@ from eval.scores.temporal_ap import temporal_records
 from eval.scores.tracks import Track, changes_f1, score_tracks, tracks_of
 from more2_jax.config import SceneConfig, preset
 from more2_jax.network.prior import Prior
+from more2_jax.network.shared_calls import side_by_side
 from more2_jax.scene import add_scan, reconstruct, start_scene
 from more2_jax.types import LivingScene
 
@@ -40,6 +41,9 @@ class Settings(OptionsBeside):
 
     samples: int = 20_000
     """Points on each surface."""
+    batch_scenes: int = 1
+    """Scenes held side by side, whose compiled calls take rows of several; `--at-once` of them work between calls.
+    Times of a scene then include waiting for the others."""
 
 
 def figures() -> list[Figure]:
@@ -59,7 +63,9 @@ def figures() -> list[Figure]:
 
 def main(options: Annotated[Settings, tyro.conf.arg(name="")]) -> None:
     """MR and MRR of the method, and of the best of each other stage combined."""
-    carry_out(PROGRAM, options)
+    if options.batch_scenes < 1:
+        raise ValueError(f"batch scenes {options.batch_scenes}; needed 1 or more")
+    carry_out(PROGRAM, replace(options, chunk=max(options.chunk, options.batch_scenes)))
 
 
 def prepare(options: Settings) -> tuple[Run, Work]:
@@ -81,7 +87,12 @@ def prepare(options: Settings) -> tuple[Run, Work]:
             for r in records_of(scene, n, m, current.data.right_deg, options.samples)
         ]
 
-    return current, lambda scenes: on_all_devices(one, scenes, options.at_once)
+    def work(scenes: Sequence[KnownScene]) -> list[list[Record]]:
+        if options.batch_scenes > 1:
+            return side_by_side(one, scenes, options.at_once, options.batch_scenes)
+        return on_all_devices(one, scenes, options.at_once)
+
+    return current, work
 
 
 def on_all_devices(

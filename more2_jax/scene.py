@@ -17,6 +17,7 @@ from more2_jax.matching.color import color_of
 from more2_jax.meshing.object_mesh import object_meshes
 from more2_jax.network.embedding_batch import embed
 from more2_jax.network.prior import Prior
+from more2_jax.network.shared_calls import side_by_side
 from more2_jax.progress import Watcher, staged
 from more2_jax.refinement.joint_of_objects import fit_objects
 from more2_jax.refinement.pose_graph_of_objects import refine_object_poses
@@ -205,6 +206,32 @@ def reconstruct(
         for c in scene.changes
     )
     return dataclasses.replace(scene, objects=tuple(objects), changes=changes, timing_s=timing)
+
+
+def run_scenes(
+    prior: Prior,
+    scenes: Sequence[Sequence[Scan]],
+    config: SceneConfig,
+    *,
+    meshes: bool = True,
+    at_once: int | None = None,
+) -> list[LivingScene]:
+    """The living scene of each scene's scans in turn, reconstructed unless `meshes` is False: many at the same time.
+
+    As one at a time to rounding. Compiled calls take rows of several scenes (`network.shared_calls`); `at_once` scenes
+    work between them, by default as many as there are cores. Raises ValueError where a scene has no scan, or its scans
+    raise one, when all others are done.
+    """
+
+    def one(scans: Sequence[Scan]) -> LivingScene:
+        scene = start_scene(prior, scans[0], config)
+        for scan in scans[1:]:
+            scene = add_scan(prior, scene, scan, config)
+        return reconstruct(prior, scene, config) if meshes else scene
+
+    if empty := [n for n, scans in enumerate(scenes) if not len(scans)]:
+        raise ValueError(f"scenes {empty} have no scans; needed one at least")
+    return side_by_side(one, scenes, at_once)
 
 
 def compared_objects(
