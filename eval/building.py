@@ -15,7 +15,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import numpy as np
 import tyro
@@ -23,7 +23,7 @@ import tyro
 from eval.data.flyingshape import flyingshape
 from eval.harness.plots import pyplot, save
 from eval.performance.stopwatch import Seconds
-from more2_jax.config import preset
+from more2_jax.config import PresetName, preset
 from more2_jax.network.prior import load_prior
 from more2_jax.progress import Progress
 from more2_jax.scene import add_scan, reconstruct, start_scene
@@ -48,7 +48,7 @@ class Settings:
     """Folder of scenes, as `train.synthesize` writes them."""
     out: Path
     """Folder of the results."""
-    preset: Literal["paper", "robust"] = "robust"
+    preset: PresetName = "robust"
     """Settings of the method."""
     prior: str = "small"
     """Name of shipped weights, or a file."""

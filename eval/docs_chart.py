@@ -17,6 +17,7 @@ RUNS = {  # kept figures, and what the chart calls them
     "real_split606": "split",
     "real_dirty606": "dirty",
     "real_merged606": "merged",
+    "fresh_real_mix": "fresh\nmix",
 }
 SHOWN = {"instance recall": "matched right (recall)", "MR": "matched and posed right (MR)"}
 CHART = Path("pictures") / "peers.png"  # below docs/

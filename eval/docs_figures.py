@@ -6,7 +6,8 @@
     <!-- figures: runs = real_cut, real_mix; show = recall, MR -->
     <!-- end of figures -->
 
-One run: a line a figure, with intervals, a column a method. Several: a line a run, ours / the best peer.
+One run: a line a figure, with intervals, a column a method; with `; lines = methods` the other way round, for runs of
+many methods. Several: a line a run, ours / the best peer.
 """
 
 from __future__ import annotations
@@ -32,9 +33,16 @@ FIGURES = {
     "t-mAP": ("t-mAP", ""),
     "t-AP50": ("t-AP50", ""),
     "median RE": ("MedRE of true pairs", "strict"),
+    "below 5°": ("RR, RE < 5°", "strict"),
+    "below 10°": ("RE < 10°", "strict"),
+    "median RE of pairs": ("MedRE", "strict"),
+    "within 5 cm": ("within 5 cm", "strict"),
     "RE < 5°": ("RE < 5°", "strict"),
-    "TE < 5 cm": ("TE < 5 cm", "strict"),
+    "mean RE": ("mean RE", "strict"),
+    "median Chamfer-L1": ("median Chamfer-L1", "strict"),
+    "IoU": ("IoU", "paper"),
     "time": ("time a scene", ""),
+    "time a pair": ("time a pair", ""),
 }
 SENSE = {"higher": 1.0, "lower": -1.0}
 OURS = "ours"  # methods whose names begin so
@@ -100,7 +108,12 @@ def table_of(what: str, figures: Path) -> str:
                 f"{path}: no such figures; needed `python -m eval.docs_figures --keep RUN --name {name}`"
             )
         runs[name] = json.loads(path.read_text(encoding="utf-8"))
-    lines = of_one(runs[names[0]], shown) if len(runs) == 1 else of_several(runs, shown)
+    if len(runs) > 1:
+        lines = of_several(runs, shown)
+    elif asked.get("lines") == "methods":
+        lines = of_methods(runs[names[0]], shown)
+    else:
+        lines = of_one(runs[names[0]], shown)
     return "\n".join(lines) + "\n"
 
 
@@ -118,6 +131,23 @@ def of_one(kept: dict[str, Any], shown: Sequence[str]) -> list[str]:
         lines.append(row_of([f"{figure} [{unit}]", *cells]))
     date = kept["date"][:10]
     return [*lines, "", f"`{kept['command']}`, {date}, {kept['rows'][0]['scenes']} rooms."]
+
+
+def of_methods(kept: dict[str, Any], shown: Sequence[str]) -> list[str]:
+    """A line a method, with intervals; a column a figure."""
+    tables = {figure: rows_of(kept, figure) for figure in shown}
+    best = {f: max(SENSE[r["better"]] * r["value"] for r in rows.values()) for f, rows in tables.items()}
+    units = {f: next(iter(rows.values()))["unit"] for f, rows in tables.items()}
+    lines = [
+        row_of(["", *(f"{f} [{unit}]" for f, unit in units.items())]),
+        row_of(["---"] * (len(shown) + 1)),
+    ]
+    for method in dict.fromkeys(r["method"] for r in kept["rows"]):
+        found = [(rows.get(method), best[f]) for f, rows in tables.items()]
+        cells = [cell(r, SENSE[r["better"]] * r["value"] >= most) if r else "" for r, most in found]
+        lines.append(row_of([method, *cells]))
+    facts = [f"`{kept['command']}`", kept["date"][:10], f"{kept['rows'][0]['scenes']} rooms"]
+    return [*lines, "", f"{', '.join(facts)}, {max(r['count'] for r in kept['rows'])} pairs."]
 
 
 def of_several(runs: dict[str, dict[str, Any]], shown: Sequence[str]) -> list[str]:
@@ -139,7 +169,8 @@ def rows_of(kept: dict[str, Any], figure: str) -> dict[str, dict[str, Any]]:
 
 def against_best(rows: dict[str, dict[str, Any]]) -> str:
     """Ours / the best of the others, the better one bold, or both."""
-    ours, others = ([r for m, r in rows.items() if m.startswith(OURS) is mine] for mine in (True, False))
+    others = [r for m, r in rows.items() if not m.startswith(OURS)]
+    ours = [r for m, r in rows.items() if m.startswith(OURS)][:1]  # the run's own preset, not its variants
     chosen = [max(side, key=lambda r: SENSE[r["better"]] * r["value"]) for side in (ours, others) if side]
     best = max((SENSE[r["better"]] * r["value"] for r in chosen), default=0.0)
     return " / ".join(bold(number(r["value"]), SENSE[r["better"]] * r["value"] >= best) for r in chosen)

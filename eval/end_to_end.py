@@ -18,7 +18,7 @@ import jax
 import tyro
 
 from eval.data.truth import KnownScene
-from eval.harness.options import Options
+from eval.harness.options import OptionsBeside
 from eval.harness.program import Program, Summary, carry_out, run_program
 from eval.harness.runs import Run, Work, open_run
 from eval.peers.end_to_end import NAME, combined
@@ -26,8 +26,9 @@ from eval.scores.divided_masks import with_divided_masks
 from eval.scores.figures import Figure, Record, in_columns
 from eval.scores.temporal_ap import temporal_records
 from eval.scores.tracks import Track, changes_f1, score_tracks, tracks_of
-from more2_jax.config import SceneConfig
+from more2_jax.config import SceneConfig, preset
 from more2_jax.network.prior import Prior
+from more2_jax.network.shared_calls import side_by_side
 from more2_jax.scene import add_scan, reconstruct, start_scene
 from more2_jax.types import LivingScene
 
@@ -35,11 +36,14 @@ TEMPORAL = {"t-mAP": "t_map", "t-AP50": "t_ap50", "AP50, scans pooled": "ap50"} 
 
 
 @dataclass(frozen=True, kw_only=True)
-class Settings(Options):
+class Settings(OptionsBeside):
     """Which data, which settings, and where results go."""
 
     samples: int = 20_000
     """Points on each surface."""
+    batch_scenes: int = 1
+    """Scenes held side by side, whose compiled calls take rows of several; `--at-once` of them work between calls.
+    Times of a scene then include waiting for the others."""
 
 
 def figures() -> list[Figure]:
@@ -59,19 +63,22 @@ def figures() -> list[Figure]:
 
 def main(options: Annotated[Settings, tyro.conf.arg(name="")]) -> None:
     """MR and MRR of the method, and of the best of each other stage combined."""
-    carry_out(PROGRAM, options)
+    if options.batch_scenes < 1:
+        raise ValueError(f"batch scenes {options.batch_scenes}; needed 1 or more")
+    carry_out(PROGRAM, replace(options, chunk=max(options.chunk, options.batch_scenes)))
 
 
 def prepare(options: Settings) -> tuple[Run, Work]:
     """The run, and what is done with its scenes."""
-    names = [f"ours, {options.preset}", *([NAME] if options.peers else [])]
+    names = [*(f"ours, {p}" for p in options.presets), *([NAME] if options.peers else [])]
     current = open_run("end_to_end", options, {"methods": names, "samples": options.samples})
-    prior, config = current.prior, current.config
-    both: list[Callable[[KnownScene], list[Track]]] = [
-        lambda s: tracks_of(living_scene(s, prior, config)),
-        lambda s: combined(s.scans, config.upright),
-    ]
-    methods = dict(zip(names, both, strict=False))
+    prior, upright = current.prior, current.config.upright
+    methods: dict[str, Callable[[KnownScene], list[Track]]] = {}
+    for name in options.presets:
+        config = preset(name, upright=upright)
+        methods[f"ours, {name}"] = lambda s, c=config: tracks_of(living_scene(s, prior, c))
+    if options.peers:
+        methods[NAME] = lambda s: combined(s.scans, bool(upright))
 
     def one(scene: KnownScene) -> list[Record]:
         return [
@@ -80,7 +87,12 @@ def prepare(options: Settings) -> tuple[Run, Work]:
             for r in records_of(scene, n, m, current.data.right_deg, options.samples)
         ]
 
-    return current, lambda scenes: on_all_devices(one, scenes, options.at_once)
+    def work(scenes: Sequence[KnownScene]) -> list[list[Record]]:
+        if options.batch_scenes > 1:
+            return side_by_side(one, scenes, options.at_once, options.batch_scenes)
+        return on_all_devices(one, scenes, options.at_once)
+
+    return current, work
 
 
 def on_all_devices(

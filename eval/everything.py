@@ -15,6 +15,7 @@ import tyro
 
 from eval import ablations, accumulation, end_to_end, matching, reconstruction, registration, report
 from eval.harness.options import Masks, Options
+from more2_jax.config import PresetName
 from train.run.program import run
 
 Program = Literal["matching", "registration", "reconstruction", "end_to_end", "accumulation", "ablations"]
@@ -38,7 +39,7 @@ class Settings:
     """Folder of all results; stopped runs resume there."""
     dataset: Literal["flyingshape", "3rscan"] = "flyingshape"
     """What the folders hold."""
-    presets: tuple[Literal["paper", "robust"], ...] = ("robust",)
+    presets: tuple[PresetName, ...] = ("robust",)
     """Settings of the method."""
     prior: str = "small"
     """Name of shipped weights, or a file."""

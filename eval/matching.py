@@ -18,7 +18,7 @@ import tyro
 
 from eval.data.truth import KnownScene
 from eval.harness.batched import embed_all
-from eval.harness.options import Options, benchmark, is_upright
+from eval.harness.options import OptionsBeside, benchmark, is_upright
 from eval.harness.program import Program, Summary, carry_out, run_program
 from eval.harness.runs import Run, Work, open_run
 from eval.peers import classifier
@@ -58,7 +58,7 @@ FIGURES = [
 
 
 @dataclass(frozen=True, kw_only=True)
-class Settings(Options):
+class Settings(OptionsBeside):
     """Which data, which settings, and where results go."""
 
     classifier: Path | None = None
@@ -72,7 +72,7 @@ def main(options: Annotated[Settings, tyro.conf.arg(name="")]) -> None:
 
 def prepare(options: Settings) -> tuple[Run, Work]:
     """The run, and what is done with its scenes."""
-    methods = own_settings(options.preset)
+    methods = own_settings(*options.presets)
     upright = is_upright(options, benchmark(options))
     peers = matchers(upright) if options.peers else {}
     if options.classifier is not None:
@@ -82,11 +82,11 @@ def prepare(options: Settings) -> tuple[Run, Work]:
     return current, lambda scenes: work(scenes, current.prior, settings, peers, options.batch)
 
 
-def own_settings(name: str) -> dict[str, CodeMatcher | EvidenceMatcher]:
-    """The preset's own matching, and the embeddings alone: Λ, 1/E, Λ ⊘ E, and Λ as the published code assigns."""
+def own_settings(*names: str) -> dict[str, CodeMatcher | EvidenceMatcher]:
+    """Each preset's own matching, and the embeddings alone: Λ, 1/E, Λ ⊘ E, and Λ as the published code assigns."""
     plain = CodeMatcher()
     return {
-        f"ours, {name}": preset(name).matching,
+        **{f"ours, {name}": preset(name).matching for name in names},
         "Λ ⊘ E": plain,
         "Λ": replace(plain, score="inv"),
         "1 / E": replace(plain, score="eqv"),

@@ -19,7 +19,7 @@ from eval.data.masks import LOST
 from eval.data.truth import KnownObject, KnownScene
 from eval.harness.batched import PairToRegister, embed_all, register_all
 from eval.harness.closed_pairs import closed_poses
-from eval.harness.options import Options, benchmark, is_upright
+from eval.harness.options import OptionsBeside, benchmark, is_upright
 from eval.harness.plots import draw_ecdf
 from eval.harness.program import Program, Summary, carry_out, run_program
 from eval.harness.runs import Run, Work, open_run
@@ -28,6 +28,7 @@ from eval.scores.figures import Figure, Record, in_columns
 from eval.scores.pose_scores import Pose, pose_scores
 from more2_jax.config import (
     DescentRegistration,
+    FieldRegistration,
     MotionModel,
     RegistrationMethod,
     SceneConfig,
@@ -43,7 +44,7 @@ KABSCH = "Kabsch on F_eqv alone"  # a learned peer, as FreeReg: one look at the 
 
 
 @dataclass(frozen=True, kw_only=True)
-class Settings(Options):
+class Settings(OptionsBeside):
     """Which data, which settings, and where results go."""
 
     pairs: Literal["first", "all"] = "all"
@@ -118,16 +119,18 @@ def main(options: Annotated[Settings, tyro.conf.arg(name="")]) -> None:
 def prepare(options: Settings) -> tuple[Run, Work]:
     """The run, and what is done with its scenes."""
     upright = is_upright(options, benchmark(options))
-    ours = own_settings(options.preset, upright)
+    ours = by_preset(options.presets, upright)
     peers = registrars() if options.peers else {}
-    current = open_run("registration", options, {"methods": [*ours, *peers], "pairs": options.pairs})
+    methods = [*(m for settings in ours.values() for m in settings), *peers]
+    current = open_run("registration", options, {"methods": methods, "pairs": options.pairs})
 
     def work(scenes: Sequence[KnownScene]) -> list[list[Record]]:
         pairs = [p for s in scenes for p in true_pairs(s, options.pairs)]
-        scene = preset(options.preset, upright=upright)
-        records = own_records(pairs, current.prior, ours, upright, options.batch, scene) + peer_records(
-            pairs, peers, upright
-        )
+        records: list[tuple[str, Record]] = []
+        for name, settings in ours.items():
+            scene = preset(name, upright=upright)
+            records += own_records(pairs, current.prior, settings, upright, options.batch, scene)
+        records += peer_records(pairs, peers, upright)
         return [[r for s, r in records if s == scene.name] for scene in scenes]
 
     return current, work
@@ -142,6 +145,15 @@ def summary(options: Settings, right_deg: float) -> Summary:
     )
 
 
+def by_preset(names: Sequence[str], upright: bool) -> dict[str, dict[str, RegistrationMethod]]:
+    """The `own_settings` of every preset; what several have is measured once."""
+    found: dict[str, dict[str, RegistrationMethod]] = {}
+    for name in names:
+        measured = {method for settings in found.values() for method in settings}
+        found[name] = {m: s for m, s in own_settings(name, upright).items() if m not in measured}
+    return found
+
+
 def own_settings(name: str, upright: bool) -> dict[str, RegistrationMethod]:
     """The preset's registration; without knowing the sensors; and without what follows the coarse search of starts."""
     method = preset(name, upright=upright).registration
@@ -150,6 +162,12 @@ def own_settings(name: str, upright: bool) -> dict[str, RegistrationMethod]:
         return {
             f"ours, {name}": method,
             f"ours, {name}, without optimization": dataclasses.replace(method, steps=0),
+            KABSCH: codes_alone,
+        }
+    if isinstance(method, FieldRegistration):
+        return {
+            f"ours, {name}": method,
+            f"ours, {name}, without optimization": dataclasses.replace(method, search_steps=0, steps=0),
             KABSCH: codes_alone,
         }
     blind = dataclasses.replace(method, search=dataclasses.replace(method.search, free_weight=0.0))

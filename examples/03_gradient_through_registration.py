@@ -1,4 +1,4 @@
-"""Gradients run from the pose a registration ends with back to the points it was given.
+"""Gradients through registration: from the pose that it ends with back to the points that it was given.
 
 You learn: `encode` and `register` can be differentiated as they are, through the encoder, the start by Kabsch, descent
 on SE(3) and ICP. A central difference confirms the number.

@@ -2,7 +2,7 @@
 
 You learn: `encode` one cloud, ask the field for its level on the seen points, `extract_mesh`, and measure the result
 against the truth. The shipped weights give a closed hull, but no good far side: measured here, the unseen surface lies
-no nearer to the mesh than to the points that were seen. Better weights change the numbers, not the calls.
+about as far from the mesh as from the points that were seen. Better weights change the numbers, not the calls.
 """
 
 import jax

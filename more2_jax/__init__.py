@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from more2_jax import renamed
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 # Public names and where they live. Imported on first use: `more2 --help` need not wait for JAX.
 _HOMES = {
@@ -33,7 +33,7 @@ _HOMES = {
     "registration.pair_batch": ("PairBatch", "batch_of", "local_batch", "observe", "pair_up"),
     "meshing.extract": ("extract_mesh",),
     "refinement.joint": ("fit_jointly",),
-    "scene": ("add_scan", "reconstruct", "start_scene"),
+    "scene": ("add_scan", "reconstruct", "run_scenes", "start_scene"),
     "scans.read_changed_scans": ("read_changed_scans",),
     "scans.read_scan": ("read_scan",),
     "storage.scene_folder": ("load_scene", "save_scene"),
@@ -53,7 +53,7 @@ if TYPE_CHECKING:
     from more2_jax.registration.register_pairs import register
     from more2_jax.scans.read_changed_scans import read_changed_scans
     from more2_jax.scans.read_scan import read_scan
-    from more2_jax.scene import add_scan, reconstruct, start_scene
+    from more2_jax.scene import add_scan, reconstruct, run_scenes, start_scene
     from more2_jax.storage.scene_folder import load_scene, save_scene
     from more2_jax.types import (
         Embedding,
@@ -103,6 +103,7 @@ __all__ = [
     "read_scan",
     "reconstruct",
     "register",
+    "run_scenes",
     "save_prior",
     "save_scene",
     "sdf",

@@ -150,10 +150,31 @@ class SurfaceRegistration:
     converged_rms: float = 0.05  # residual below which a pose that has settled is called converged
 
 
+@dataclass(frozen=True)
+class FieldRegistration:
+    """Registration on the completed surfaces alone (beyond the paper, without ICP); lengths in shares of the radius."""
+
+    method: Literal["field"] = "field"  # names these settings
+    turns: int = (
+        24  # of the codes' rotation, about the vertical, upright; in any orientation all 60 of an icosahedron
+    )
+    search_points: int = 64  # of each cloud, asked of the other's field while all starts are aligned
+    search_steps: int = 6  # of Gauss-Newton, of every start
+    first_reach: float = 0.3  # a point so far off the surface counts a quarter, in the first step
+    search_reach: float = 0.1  # in the last of the search, and the first that refines
+    keep: int = 4  # poses, each turned otherwise, that are refined
+    points: int = 512  # of each cloud, then
+    steps: int = 10  # of Gauss-Newton, of the poses that are refined
+    last_reach: float = 0.02  # in the last of these
+    trim: float = 0.7  # share of nearest distances that counts in the residual
+    converged_rms: float = 0.05  # residual below which a pose that has settled is called converged
+
+
 Matcher = CodeMatcher | EvidenceMatcher
-RegistrationMethod = DescentRegistration | SurfaceRegistration
+RegistrationMethod = DescentRegistration | SurfaceRegistration | FieldRegistration
 # How objects move between scans: any rigid motion, or shifts and turns about the vertical (z) only.
 MotionModel = Literal["free", "upright"]
+PresetName = Literal["robust", "field", "paper"]
 
 
 @dataclass(frozen=True)
@@ -210,7 +231,8 @@ class SceneConfig:
     """The whole method; `preset('paper')` follows the paper, `preset('robust')` is the default."""
 
     preset: str = "paper"  # whose settings these are, or began as
-    upright: bool = False  # objects turn about the vertical (z) only
+    # Objects turn about the vertical (z) only; None: where the first scan shows a level floor.
+    upright: bool | None = None
     min_points: int = 64  # objects seen with fewer are skipped, and reported
     static_deg: float = 1.0  # an object that turned by less,
     static_m: float = 0.05  # and moved by less, is static
@@ -230,7 +252,7 @@ class SceneConfig:
 
     @property
     def motion(self) -> MotionModel:
-        """How objects may move."""
+        """How objects may move; in any way while `upright` is not settled."""
         return "upright" if self.upright else "free"
 
 
@@ -248,10 +270,12 @@ ROBUST_MESHING = MeshingConfig(
 )
 
 
-def preset(name: str, *, upright: bool = False) -> SceneConfig:
-    """Returns the settings called `paper` or `robust`."""
+def preset(name: str, *, upright: bool | None = None) -> SceneConfig:
+    """Returns the settings called `paper`, `field` (its poses by the completed fields alone) or `robust`."""
     if name == "paper":
         return SceneConfig(upright=upright)
+    if name == "field":
+        return SceneConfig(preset="field", upright=upright, registration=FieldRegistration())
     if name == "robust":
         return SceneConfig(
             preset="robust",
@@ -267,7 +291,7 @@ def preset(name: str, *, upright: bool = False) -> SceneConfig:
             # (docs/developing/notebook/design_decisions.md).
             joint=JointConfig(points=128, start="accumulated", steps=0, eqv_learning_rate=1e-3),
         )
-    raise ValueError(f"preset {name!r}; needed 'paper' or 'robust'")
+    raise ValueError(f"preset {name!r}; needed 'paper', 'field' or 'robust'")
 
 
 # Keys of older weight files and settings.

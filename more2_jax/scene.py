@@ -17,13 +17,14 @@ from more2_jax.matching.color import color_of
 from more2_jax.meshing.object_mesh import object_meshes
 from more2_jax.network.embedding_batch import embed
 from more2_jax.network.prior import Prior
+from more2_jax.network.shared_calls import side_by_side
 from more2_jax.progress import Watcher, staged
 from more2_jax.refinement.joint_of_objects import fit_objects
 from more2_jax.refinement.pose_graph_of_objects import refine_object_poses
 from more2_jax.tracking.accumulated import accumulated_objects, embed_accumulated, with_refined
 from more2_jax.tracking.changes import changes_between, forgotten, not_seen_in
 from more2_jax.tracking.identify import Found, Identified, identify
-from more2_jax.tracking.leveling import as_given, level_of, leveled
+from more2_jax.tracking.leveling import as_given, level_of, leveled, shows_floor
 from more2_jax.tracking.looked_at import not_looked_at
 from more2_jax.tracking.mask_borders import mend_borders
 from more2_jax.tracking.merged_masks import Divided, divide_merged
@@ -64,6 +65,7 @@ def start_scene(
 
     `progress` is told of every stage, here and below.
     """
+    config = settled(config, shows_floor(scan) if config.upright is None else config.upright)
     level, T_level_scan = leveled_scan(scan, config)
     masks, skipped = usable(level, config)
     cleared = without_floor_and_walls(masks, level, config)
@@ -75,7 +77,7 @@ def start_scene(
     return LivingScene(
         preset=config.preset,
         prior=prior.name,
-        upright=config.upright,
+        upright=bool(config.upright),
         scans=(record(0, scan, instances, skipped, frame, repairs=cleared.repairs(0, objects)),),
         objects=tuple(objects),
         changes=(),
@@ -118,6 +120,7 @@ def add_scan(
     Objects that were absent for a while can come back. Meshes of objects seen again are dropped; `reconstruct`
     makes them anew. Raises ValueError if the scan has no usable instance.
     """
+    config = settled(config, scene.upright)
     level, T_level_scan = leveled_scan(scan, config, scene.scans[0])
     masks, skipped = usable(level, config)
     cleared = without_floor_and_walls(masks, level, config)
@@ -138,7 +141,7 @@ def add_scan(
             changed = [f.object for f, s in zip(found, seen, strict=True) if s.accumulated]
             objects = embed_accumulated(prior, objects, changed)
     missing, left = mended.left_over([(f.object, f.instance) for f in found])
-    unseen = not_looked_at(objects, missing, level, frame.T_scene_scan, config.upright)
+    unseen = not_looked_at(objects, missing, level, frame.T_scene_scan, scene.upright)
     first = next_number(objects, scene.scans)
     fresh = new_objects(first, index, left, whole.instances, [o.embedding for o in new], frame)
     chance = chances(identified, objects, fresh, config)
@@ -147,9 +150,8 @@ def add_scan(
     repairs = (*whole.repairs, *whole.masks(found, fresh), *mended.repairs)
     repairs = (*repairs, *cleared.repairs(index, objects, mended.repairs), *borders)
     scans = (*scene.scans, record(index, scan, masks, skipped, frame, unseen, repairs))
-    changes = changes_between(objects, index - 1, index, config, chance, not_seen_in(scans))
-    changed = {"scans": scans, "objects": tuple(objects), "changes": (*scene.changes, changes)}
-    return dataclasses.replace(scene, **changed, timing_s=timing)
+    changes = (*scene.changes, changes_between(objects, index - 1, index, config, chance, not_seen_in(scans)))
+    return dataclasses.replace(scene, scans=scans, objects=tuple(objects), changes=changes, timing_s=timing)
 
 
 def chances(
@@ -178,7 +180,7 @@ def reconstruct(
     (`paper`): code and poses of all objects are optimized in one call (§3.5). Observations in doubt
     (`Observation.accumulated` False) have no part in it. Objects with a mesh have not changed since and are left alone.
     """
-    timing, objects = dict(scene.timing_s), list(scene.objects)
+    config, timing, objects = settled(config, scene.upright), dict(scene.timing_s), list(scene.objects)
     todo = [k for k, o in enumerate(objects) if o.mesh is None]
     again = [k for k in todo if len(accumulated(objects[k])) > 1]
     align, fit = again if config.pose_graph.steps else [], again if config.joint.steps else []
@@ -204,6 +206,32 @@ def reconstruct(
         for c in scene.changes
     )
     return dataclasses.replace(scene, objects=tuple(objects), changes=changes, timing_s=timing)
+
+
+def run_scenes(
+    prior: Prior,
+    scenes: Sequence[Sequence[Scan]],
+    config: SceneConfig,
+    *,
+    meshes: bool = True,
+    at_once: int | None = None,
+) -> list[LivingScene]:
+    """The living scene of each scene's scans in turn, reconstructed unless `meshes` is False: many at the same time.
+
+    As one at a time to rounding. Compiled calls take rows of several scenes (`network.shared_calls`); `at_once` scenes
+    work between them, by default as many as there are cores. Raises ValueError where a scene has no scan, or its scans
+    raise one, when all others are done.
+    """
+
+    def one(scans: Sequence[Scan]) -> LivingScene:
+        scene = start_scene(prior, scans[0], config)
+        for scan in scans[1:]:
+            scene = add_scan(prior, scene, scan, config)
+        return reconstruct(prior, scene, config) if meshes else scene
+
+    if empty := [n for n, scans in enumerate(scenes) if not len(scans)]:
+        raise ValueError(f"scenes {empty} have no scans; needed one at least")
+    return side_by_side(one, scenes, at_once)
 
 
 def compared_objects(
@@ -276,6 +304,11 @@ def with_borders_mended(
     index = len(scene.scans)
     backgrounds = {s.index: s.background for s in scene.scans} | {index: scan.background}
     return mend_borders(objects, [f.object for f in found], index, backgrounds)
+
+
+def settled(config: SceneConfig, upright: bool) -> SceneConfig:
+    """The settings of a scene whose first scan has said whether things stay upright, where they leave it open."""
+    return dataclasses.replace(config, upright=upright) if config.upright is None else config
 
 
 def leveled_scan(scan: Scan, config: SceneConfig, first: ScanRecord | None = None) -> tuple[Scan, Pose]:

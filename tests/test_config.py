@@ -2,6 +2,7 @@
 
 import dataclasses
 from dataclasses import replace
+from typing import get_args
 
 import pytest
 from places import ROOT
@@ -11,6 +12,8 @@ from more2_jax.config import (
     CodeMatcher,
     DescentRegistration,
     EvidenceMatcher,
+    FieldRegistration,
+    PresetName,
     PriorConfig,
     SceneConfig,
     SurfaceRegistration,
@@ -32,7 +35,7 @@ def test_shipped_configurations_load_and_round_trip(path, tmp_path):
 
 
 @pytest.mark.parametrize("upright", [False, True])
-@pytest.mark.parametrize("name", ["paper", "robust"])
+@pytest.mark.parametrize("name", get_args(PresetName))
 def test_presets_round_trip(name, upright, tmp_path):
     config = preset(name, upright=upright)
     assert (config.preset, config.upright) == (name, upright)
@@ -47,6 +50,12 @@ def test_paper_is_the_paper():
     assert paper.registration == DescentRegistration(steps=200, trim=1.0)
     assert (paper.joint.start, paper.joint.steps) == ("best", 200)
     assert not paper.accumulate_target
+
+
+def test_field_is_the_paper_but_for_its_poses():
+    field, paper = preset("field"), preset("paper")
+    assert isinstance(field.registration, FieldRegistration)
+    assert replace(field, preset="paper", registration=paper.registration) == paper
 
 
 def test_robust_searches_alike_in_matching_and_registration():
@@ -68,14 +77,14 @@ def test_base_has_the_published_widths():
             assert getattr(getattr(model, part), name) == getattr(getattr(published, part), name), name
 
 
-@pytest.mark.parametrize("name", ["paper", "robust"])
+@pytest.mark.parametrize("name", get_args(PresetName))
 def test_motion_says_how_objects_may_move(name):
     assert preset(name).motion == "free"
     assert preset(name, upright=True).motion == "upright"
 
 
 def test_unknown_preset_names_the_known():
-    with pytest.raises(ValueError, match="'fast'; needed 'paper' or 'robust'"):
+    with pytest.raises(ValueError, match="'fast'; needed 'paper', 'field' or 'robust'"):
         preset("fast")
 
 

@@ -14,7 +14,14 @@ import pytest
 from compiling import quick_jit
 
 import more2_jax as m2
-from more2_jax.config import CodeMatcher, DescentRegistration, JointConfig, SurfaceRegistration, SurfaceSearch
+from more2_jax.config import (
+    CodeMatcher,
+    DescentRegistration,
+    FieldRegistration,
+    JointConfig,
+    SurfaceRegistration,
+    SurfaceSearch,
+)
 from more2_jax.geometry.full_precision import full_precision
 from more2_jax.network.prior import encode_ordered
 from more2_jax.refinement.joint import Observations
@@ -23,6 +30,7 @@ from more2_jax.refinement.pose_graph import OrientedObservations, optimize_pose_
 ROWS, REAL, OBJECTS, SEEN = 256, 200, 3, 2
 MASK = np.arange(ROWS) < np.full((OBJECTS, 1), REAL)  # closed over
 DESCENT = DescentRegistration(points=32, sdf_points=32, steps=2, icp_steps=2)
+FIELD = FieldRegistration(turns=2, search_points=16, search_steps=1, keep=1, points=32, steps=2)
 SEARCH = SurfaceSearch(turns=4, keep=2, points=32, dense=64, cells=8, steps=3)
 SURFACE = SurfaceRegistration(
     search=SEARCH, points=32, steps=2, field_points=32, polish_points=32, polish_steps=1
@@ -87,6 +95,7 @@ PROGRAMS = {
     "sdf": lambda x, prior, code: m2.sdf(prior, code, x),
     "sdf, own code": lambda x, prior, code: m2.sdf(prior, m2.encode(prior, cloud_of(x)), x),
     "register, descent": lambda x, prior, code: m2.register(prior, pairs_of(x, code), DESCENT),
+    "register, field": lambda x, prior, code: m2.register(prior, pairs_of(x, code), FIELD, "upright"),
     "register, surface": lambda x, prior, code: m2.register(prior, pairs_of(x, code), SURFACE),
     "register, upright": lambda x, prior, code: m2.register(prior, pairs_of(x, code), SURFACE, "upright"),
     "fit_jointly": lambda x, prior, code: m2.fit_jointly(prior, observations_of(x, code), JOINT),

@@ -11,6 +11,7 @@ import numpy as np
 from eval.data.flyingshape import flyingshape
 from eval.data.threerscan import threerscan
 from eval.data.truth import Benchmark, KnownScene
+from more2_jax.config import PresetName
 
 Masks = Literal["true", "merged", "split", "eroded", "wrong", "predicted"]
 
@@ -25,7 +26,7 @@ class Options:
     """Folder of the results; a stopped run resumes there."""
     dataset: Literal["flyingshape", "3rscan"] = "flyingshape"
     """flyingshape: written by train.synthesize, or the published npz files."""
-    preset: Literal["paper", "robust"] = "robust"
+    preset: PresetName = "robust"
     """Settings of the method."""
     prior: str = "small"
     """Name of shipped weights, or a file."""
@@ -59,6 +60,19 @@ class Options:
     """Processes that stay alive over scenes; 0: this one alone. With --ray: actors, 0 for one a GPU, or one a core."""
     ray: str | None = None
     """Address of a Ray cluster whose actors do the work ("local" starts one here)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class OptionsBeside(Options):
+    """Of programs whose tables may show several presets, on the same scenes."""
+
+    beside: tuple[PresetName, ...] = ()
+    """Other presets, each measured as further columns."""
+
+    @property
+    def presets(self) -> tuple[PresetName, ...]:
+        """All, the run's own first, each once."""
+        return tuple(dict.fromkeys((self.preset, *self.beside)))
 
 
 def benchmark(o: Options) -> Benchmark:

@@ -52,7 +52,8 @@ def run_scans(
     check_output(out)
     _check_log(reporting, out)
     with scene_lock(out), session or Session(reporting) as session:
-        session.log(f"settings: preset {config.preset}, prior {prior_name}, upright {config.upright}")
+        turns = "as the first scan shows" if config.upright is None else config.upright
+        session.log(f"settings: preset {config.preset}, prior {prior_name}, upright {turns}")
         scans = read_all(session, paths, config, reading, masks or [None] * len(paths))
         keep_compiled_programs()
         prior = (load or load_prior)(prior_name)
@@ -77,6 +78,7 @@ def _build(
         for scan in scans[kept:]:
             if scene is None:
                 scene = start_scene(prior, scan, config, progress=session.watch)
+                _say_how_objects_move(session, scene, scan, config)
             else:
                 scene = add_scan(prior, scene, scan, config, progress=session.watch)
             _say_done(session, scene)
@@ -95,6 +97,18 @@ def _build(
         if not kept:
             raise
         raise KeyboardInterrupt(how) from error
+
+
+def _say_how_objects_move(session: Session, scene: LivingScene, scan: Scan, config: SceneConfig) -> None:
+    """Where the settings left it to the first scan."""
+    import numpy as np
+
+    from more2_jax.geometry.up_axis import likely_up_axis
+    from more2_jax.report import upright_text
+
+    if config.upright is None:
+        points = np.concatenate([scan.background, *(i.points for i in scan.instances)])
+        session.say(upright_text(scan.name, scene.upright, likely_up_axis(points)[0]))
 
 
 def reason_of(error: OSError) -> str:

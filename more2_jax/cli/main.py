@@ -9,15 +9,26 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
-from tyro.conf import OmitArgPrefixes, OmitSubcommandPrefixes, Positional, arg, subcommand
+from tyro.conf import (
+    FlagCreatePairsOff,
+    OmitArgPrefixes,
+    Positional,
+    arg,
+    create_mutex_group,
+    subcommand,
+)
 
-from more2_jax.cli import batch, places, priors, scenes
+from more2_jax import __version__
+from more2_jax.cli import batch, doctor, places, scenes
 from more2_jax.cli import living_scenes as building
-from more2_jax.cli.options import PresetName, Reading, Reporting
+from more2_jax.cli.options import Reading, Reporting
+from more2_jax.cli.prior_commands import PriorCommand
 from more2_jax.cli.session import one_line
 from more2_jax.cli.settings import scene_config
 from more2_jax.cli.settings_page import settings_page
+from more2_jax.config import PresetName
 
+TURNS = create_mutex_group(required=False)
 BAD_INPUT = (ValueError, FileNotFoundError, PermissionError, IsADirectoryError, NotADirectoryError)
 
 
@@ -31,7 +42,8 @@ class Demo:
     out: Path = Path("demo_scene")
     """Folder of the living scene, saved after every scan; new, empty, or a living scene to replace."""
     preset: PresetName = "robust"
-    """robust: several starts a pair. paper: as in the paper (docs/concepts/paper.md says what differs)."""
+    """robust: several starts a pair. field: poses by completed shapes alone. paper: as in the paper. Each has a card in
+    docs/concepts."""
     upright: bool = True
     """Objects turn about the vertical (z) only."""
     prior: str = "small"
@@ -50,7 +62,7 @@ class Demo:
 class Run:
     """A living scene from scans in time order. One scan is reconstructed; more are compared.
 
-    Example: more2 run monday.ply friday.ply --out my_room --upright
+    Example: more2 run monday.ply friday.ply --out my_room
     """
 
     scans: Annotated[Positional[tuple[Path, ...]], arg(metavar="SCAN [SCAN ...]")]
@@ -58,9 +70,12 @@ class Run:
     out: Path
     """Folder of the living scene, saved after every scan; new, empty, or a living scene to replace."""
     preset: PresetName = "robust"
-    """robust: several starts a pair. paper: as in the paper (docs/concepts/paper.md says what differs)."""
-    upright: bool = False
-    """Objects turn about the vertical (z) only."""
+    """robust: several starts a pair. field: poses by completed shapes alone. paper: as in the paper. Each has a card in
+    docs/concepts."""
+    upright: Annotated[bool, TURNS, FlagCreatePairsOff] = False
+    """Objects turn about the vertical (z) only; by default where the first scan shows a level floor."""
+    any_orientation: Annotated[bool, TURNS, FlagCreatePairsOff] = False
+    """Objects turn in any way, whatever the first scan shows."""
     prior: str = "small"
     """Name of shipped weights, or a file."""
     masks: tuple[Path, ...] = ()
@@ -75,7 +90,8 @@ class Run:
     reporting: Reporting = field(default_factory=Reporting)
 
     def __call__(self) -> int:
-        config = scene_config(self.preset, self.upright, self.config, keep_masks=self.keep_masks)
+        upright = True if self.upright else False if self.any_orientation else None
+        config = scene_config(self.preset, upright, self.config, keep_masks=self.keep_masks)
         building.run_scans(
             self.scans,
             self.out,
@@ -98,7 +114,7 @@ class Batch:
 
     manifest: Positional[Path]
     """Columns: name, scans (in CSV separated by ;), and as needed out, masks, preset, upright, prior, keep_masks,
-    config, unit, instance_property, segment, depth_frames. Paths are relative to the file."""
+    config, unit, instance_property, segment, up, depth_frames. Paths are relative to the file."""
     out: Path
     """Folder of all scenes, each named after its row unless the row says out; and of the table of results."""
     workers: int | None = None
@@ -248,84 +264,6 @@ class Find:
 
 
 @dataclass(frozen=True)
-class PriorList:
-    """The weights inside the package.
-
-    Example: more2 prior list
-    """
-
-    def __call__(self) -> int:
-        priors.list_shipped()
-        return 0
-
-
-@dataclass(frozen=True)
-class PriorInfo:
-    """What a weight file holds.
-
-    Example: more2 prior info small
-    """
-
-    name: Positional[str]
-    """Name of shipped weights, or a file."""
-
-    def __call__(self) -> int:
-        priors.info(self.name)
-        return 0
-
-
-@dataclass(frozen=True)
-class PriorImport:
-    """The published PyTorch checkpoint converted, in full precision; runs no code from the file.
-
-    Example: more2 prior import published.pt published.npz
-    """
-
-    checkpoint: Positional[Path]
-    """A checkpoint with the published names under model_state_dict."""
-    out: Positional[Path]
-    """The weight file to write; a new .npz."""
-
-    def __call__(self) -> int:
-        priors.import_published(self.checkpoint, self.out)
-        return 0
-
-
-@dataclass(frozen=True)
-class PriorCheck:
-    """Largest deviations of converted weights from a reference's outputs; exit 0 only if all are below 1e-5.
-
-    Example: more2 prior check published.pt reference.npz
-    """
-
-    checkpoint: Positional[Path]
-    """A checkpoint; or, alone, a reference that holds the weights too."""
-    reference: Positional[Path | None] = None
-    """NPZ of points, queries, F_inv, F_eqv, F_s, F_c and sdf."""
-
-    def __call__(self) -> int:
-        return priors.check(self.checkpoint, self.reference)
-
-
-@dataclass(frozen=True)
-class PriorCommand:
-    """Weights: shipped, the published checkpoint converted, your own.
-
-    Example: more2 prior list
-    """
-
-    action: OmitSubcommandPrefixes[
-        Annotated[PriorList, subcommand("list")]
-        | Annotated[PriorInfo, subcommand("info")]
-        | Annotated[PriorImport, subcommand("import")]
-        | Annotated[PriorCheck, subcommand("check")]
-    ]
-
-    def __call__(self) -> int:
-        return self.action()
-
-
-@dataclass(frozen=True)
 class Settings:
     """Every setting of a preset on one page, as Markdown: name, value, meaning.
 
@@ -333,10 +271,40 @@ class Settings:
     """
 
     preset: PresetName = "robust"
-    """robust: several starts a pair. paper: as in the paper (docs/concepts/paper.md says what differs)."""
+    """robust: several starts a pair. field: poses by completed shapes alone. paper: as in the paper. Each has a card in
+    docs/concepts."""
 
     def __call__(self) -> int:
-        print(settings_page(scene_config(self.preset, False, None)), end="")
+        print(settings_page(scene_config(self.preset, None, None)), end="")
+        return 0
+
+
+@dataclass(frozen=True)
+class Doctor:
+    """Whether this installation works: versions, devices, cache, extras, memory, and a short test of the method.
+
+    Example: more2 doctor --json
+    """
+
+    json: bool = False
+    """Print one JSON object."""
+
+    def __call__(self) -> int:
+        return doctor.doctor(as_json=self.json)
+
+
+@dataclass(frozen=True)
+class Completion:
+    """A script that completes commands and flags in a shell; goes to standard output.
+
+    Example: more2 completion bash
+    """
+
+    shell: Positional[Literal["bash", "zsh", "fish"]]
+    """The shell that reads it, as in `eval "$(more2 completion bash)"`."""
+
+    def __call__(self) -> int:
+        parsed(["--tyro-write-completion", self.shell, "-"])  # prints it and ends the process
         return 0
 
 
@@ -352,18 +320,29 @@ Command = (
     | Annotated[Find, subcommand("find")]
     | Annotated[Settings, subcommand("settings")]
     | Annotated[PriorCommand, subcommand("prior")]
+    | Annotated[Doctor, subcommand("doctor")]
+    | Annotated[Completion, subcommand("completion")]
 )
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Runs one command; returns the exit code. Unforeseen exceptions pass through, with their traceback."""
-    command = tyro.cli(
+def parsed(argv: Sequence[str] | None) -> Command:
+    """The command that the words name; ends the process where they ask for help or do not fit."""
+    return tyro.cli(
         Command,  # type: ignore[arg-type]
         args=argv,
         prog="more2",
         description="Living scenes: objects found again and reconstructed over scans of one place.",
         config=(OmitArgPrefixes,),
     )
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Runs one command; returns the exit code. Unforeseen exceptions pass through, with their traceback."""
+    words = sys.argv[1:] if argv is None else list(argv)
+    if words == ["--version"]:
+        print(f"more2 {__version__}")
+        return 0
+    command = parsed(words)
     try:
         return command()
     except BAD_INPUT as error:

@@ -9,10 +9,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, get_args
 
-from more2_jax.cli.options import PresetName, Reading, Segment, Unit
+from more2_jax.cli.options import Axis, Reading, Segment, Unit
 from more2_jax.cli.settings import scene_config
 from more2_jax.cli.tables import needs_parquet
-from more2_jax.config import SceneConfig
+from more2_jax.config import PresetName, SceneConfig
 
 SEPARATOR = ";"  # between the scans of a cell of CSV
 YES, NO = ("true", "yes", "1"), ("false", "no", "0")
@@ -28,7 +28,7 @@ class SceneJob:
     out: Path
     masks: tuple[Path, ...] = ()
     preset: str = "robust"
-    upright: bool = False
+    upright: bool | None = None  # as the first scan's floor says
     prior: str = "small"
     keep_masks: bool = False
     config: Path | None = None
@@ -179,5 +179,6 @@ CELLS: dict[str, Callable[[Any, Path], Any]] = {
     "unit": _one_of(Unit),
     "instance_property": _text,
     "segment": _one_of(Segment),
+    "up": _one_of(Axis),
     "depth_frames": _flag,
 }

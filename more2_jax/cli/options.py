@@ -8,7 +8,7 @@ from typing import Literal
 
 Unit = Literal["m", "cm", "mm"]
 Segment = Literal["changes", "geometric"]
-PresetName = Literal["robust", "paper"]
+Axis = Literal["x", "y", "z", "-x", "-y", "-z"]
 
 
 @dataclass(frozen=True)
@@ -22,6 +22,8 @@ class Reading:
     segment: Segment | None = None
     """How to cut scans without masks. changes: by what changed between two or more scans of one room. geometric: one
     scan alone into planes and clusters. Masks from a network are better."""
+    up: Axis = "z"
+    """Axis that is up in the files (y in what many phones export); the scene's is z."""
     depth_frames: bool = False
     """Points from the raw depth of a 3RScan folder rather than from its mesh."""
 

@@ -11,7 +11,9 @@ import yaml
 from more2_jax.config import SceneConfig, from_dict, preset
 
 
-def scene_config(name: str, upright: bool, path: Path | None, *, keep_masks: bool = False) -> SceneConfig:
+def scene_config(
+    name: str, upright: bool | None, path: Path | None, *, keep_masks: bool = False
+) -> SceneConfig:
     """The preset called `name` with the values of the YAML file at `path`, if any, in place of its own.
 
     `keep_masks` has masks left as they are. Raises ValueError, in one line, for an unknown preset or a file that is

@@ -15,7 +15,7 @@ from more2_jax.config import SceneConfig
 HEAD = """# Every setting of preset `{preset}`
 
 Written by `more2 settings --preset {preset}`. A YAML file given to `--config` replaces values by these names
-([how](../guides/settings.md#changing-single-values)).
+(docs/guides/settings.md says how).
 """
 
 

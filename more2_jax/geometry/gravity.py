@@ -26,8 +26,14 @@ LEAST_WIDTH_M = (
     0.15  # standard deviation of the levels' points, the narrower way: of a strip half a meter wide
 )
 # Of the points about the fullest level so many lie within `SCALE_M`: clutter lies at any height.
-LEAST_THIN = 0.8
+LEAST_THIN = 0.5
+# Floors and ceilings are at the ends of a room; tops of furniture, whose edges masks leave, have legs below and lamps
+# above them. Levels at an end hold so much of the fullest.
+LEAST_AT_END = 0.6
 LEAST_GAIN = 1.1  # levels hold so many times what they hold along z, or up is z
+MOST_BEYOND = (
+    0.05  # share of a scan below its floor, or above its ceiling: noise, a stair seen through a door
+)
 REACH_M = 50.0  # along an axis: a stray point a kilometer off must not make a million layers
 TRIED_POINTS = 5000  # at even steps, along the directions tried
 MOST_POINTS = 20_000  # at even steps, for the rest
@@ -56,8 +62,8 @@ class Gravity:
 def gravity(points: Points) -> Gravity | None:
     """The common normal of the levels of a background, within about `MAX_TILT_DEG` of z.
 
-    None where levels hold less than `LEAST_ON_LEVELS` of the points, or the fullest is no thin one: no floor is seen,
-    or z is not up. z itself where the scan's levels hold hardly less along it.
+    None where levels hold less than `LEAST_ON_LEVELS` of the points, or none of the fullest is a floor or a ceiling:
+    neither is seen, or z is not up. z itself where the scan's levels hold hardly less along it.
     """
     points = about_middle(points[:: max(1, -(-len(points) // MOST_POINTS))])
     if len(points) < LEAST_POINTS:
@@ -72,14 +78,38 @@ def gravity(points: Points) -> Gravity | None:
         if fitted is None:
             return None
         up = fitted
-    levels = list(levels_along(points @ up))
-    if not levels or thinness(points @ up, levels[0][0]) < LEAST_THIN:
+    if not is_bounded(points @ up):
         return None
     along_z = sum(held for _, held in levels_along(points[:, 2]))
     if share < LEAST_GAIN * along_z:
         return Gravity(up=np.array([0.0, 0.0, 1.0]), share=float(along_z))
     found = Gravity(up=up, share=float(share))
     return found if found.tilt_deg <= MAX_TILT_DEG + GRIDS_DEG[0] else None
+
+
+def is_bounded(along: Float[np.ndarray, " n"]) -> bool:
+    """Whether a level at an end of the heights, a floor or a ceiling, is thin and among the fullest."""
+    levels = list(levels_along(along))
+    return any(
+        share >= LEAST_AT_END * levels[0][1]
+        and min(beyond(along, height), beyond(-along, -height)) <= MOST_BEYOND
+        and thinness(along, height) >= LEAST_THIN
+        for height, share in levels
+    )
+
+
+def stand_on_floor(points: Points, up: Direction) -> bool:
+    """Whether nearly all points of a scan, things and background, lie on or above a level across `up`.
+
+    A wall before a camera that looks along z is a level, too, with everything below it.
+    """
+    along = about_middle(points[:: max(1, -(-len(points) // MOST_POINTS))]) @ up
+    return any(beyond(along, height) <= MOST_BEYOND for height, _ in levels_along(along))
+
+
+def beyond(along: Float[np.ndarray, " n"], height: float) -> float:
+    """Share of the points below a level."""
+    return float(np.mean(along < height - 2 * BAND_M))
 
 
 def least_turn(up: Direction) -> Float[np.ndarray, "3 3"]:

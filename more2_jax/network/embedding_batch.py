@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
+from functools import partial
 
 import jax
 import numpy as np
@@ -10,11 +12,13 @@ from jaxtyping import Bool
 
 from more2_jax.geometry.padding import MAX_POINTS, Rows, bucket, pad_batch, pad_clouds
 from more2_jax.network.prior import Prior, encode
+from more2_jax.network.row_map import chunked
 from more2_jax.types import Embedding, PointCloud
 
 SMALLEST_BATCH = (
     8  # objects a call: scenes of any size share their compiled programs, and what these take of memory
 )
+PADDED_TOGETHER = 64  # clouds, a whole number of calls also on accelerators
 
 
 def padded(
@@ -29,10 +33,11 @@ def embed(
 ) -> list[Embedding]:
     """One embedding per cloud, `SMALLEST_BATCH` a call; `normals` as `pad_clouds` takes them."""
     found = list[Embedding]()
-    for start in range(0, max(len(clouds), 1), SMALLEST_BATCH):
-        some = slice(start, start + SMALLEST_BATCH)
-        batch = padded(clouds[some], normals=None if normals is None else normals[some])
-        found += unstack(encode(prior, batch), len(clouds[some]))
+    for start in range(0, max(len(clouds), 1), PADDED_TOGETHER):
+        some = slice(start, start + PADDED_TOGETHER)
+        batch = pad_clouds(clouds[some], MAX_POINTS, None if normals is None else normals[some])
+        codes = chunked(partial(encode, prior), SMALLEST_BATCH, dataclasses.replace(batch, origin=None))
+        found += unstack(dataclasses.replace(codes, origin=batch.origin), len(clouds[some]))
     return found
 
 

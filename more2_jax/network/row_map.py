@@ -11,6 +11,8 @@ from jax.core import Tracer
 from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Int
 
+from more2_jax.network.shared_calls import CURRENT
+
 Tree = Any  # of arrays
 WIDER = 8  # times as many rows in a call of `chunked` on an accelerator
 
@@ -42,7 +44,8 @@ def chunked(function: Callable[[Tree], Tree], size: int, rows: Tree) -> Tree:
     """`function` of `rows` (leading axis b), in calls of `size` rows each: one compiled program whatever b is.
 
     Accelerators take `WIDER` times as many; several local devices take calls in turn, side by side. The last call is
-    filled up with its first row; of no rows there is none. Where anything is traced, the number of rows is part of a
+    filled up with its first row; of no rows there is none. Where scenes are worked on side by side (`shared_calls`),
+    the last call is made with rows of other scenes. Where anything is traced, the number of rows is part of a
     larger program anyway: they go in one call. Results are host arrays, but for traced ones.
     """
     if traced(rows):
@@ -60,9 +63,21 @@ def chunked_at(
     What many rows share (an object that is part of many pairs) is so never held once a row.
     """
     size = size if jax.default_backend() == "cpu" else WIDER * size
-    devices, found = jax.local_devices(), []
     if not count:
         return _of_no_rows(function, taken(np.zeros(0, int)))
+    shared, over = CURRENT.get(), count % size
+    if shared is None or not over or traced(rest := taken(np.arange(count - over, count))):
+        return _in_calls(function, size, count, taken)
+    found = [_in_calls(function, size, count - over, taken)] if count > over else []
+    found.append(shared.call(function, size, jax.tree.map(np.asarray, rest)))
+    return jax.tree.map(lambda *x: np.concatenate(x), *found)
+
+
+def _in_calls(
+    function: Callable[[Tree], Tree], size: int, count: int, taken: Callable[[Int[np.ndarray, " k"]], Tree]
+) -> Tree:
+    """`chunked_at` of one row or more, without others' rows."""
+    devices, found = jax.local_devices(), []
     for wave in range(0, count, size * len(devices)):
         starts = range(wave, max(min(wave + size * len(devices), count), wave + 1), size)
         calls = []

@@ -7,8 +7,8 @@ import os
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 
-import jax
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -22,6 +22,7 @@ from more2_jax.meshing.object_mesh import object_floor
 from more2_jax.meshing.observed_surface import ObservedSurface, uniform_subsample
 from more2_jax.network.embedding_batch import SMALLEST_BATCH, embed
 from more2_jax.network.prior import Prior
+from more2_jax.network.row_map import chunked
 from more2_jax.refinement.pose_graph import OrientedObservations, optimize_pose_graphs
 from more2_jax.types import AccumulatedObject
 
@@ -31,6 +32,9 @@ from more2_jax.types import AccumulatedObject
 SURFACE_POINTS, COMPARED_POINTS = 8192, 1024
 MAX_OBSERVATIONS = 32  # of an object: its first, and the last of the others; more stay as registered
 MIN_OBSERVATIONS = 4  # of the padded batch: objects seen two to four times share one compiled program
+OBJECTS_A_CALL = (
+    1  # optimized together: on a CPU one after the other, so that nothing is worked on to fill a call
+)
 # Poses are made better here, not found: among noise an observation that would turn farther has slipped along the
 # others (docs/developing/notebook/pose_graph.md has a table of such limits).
 MAX_TURN_DEG = 3.0
@@ -65,8 +69,8 @@ def with_poses_refined(
         batches[bucket(len(row), MIN_OBSERVATIONS)].append(n)
     for count, rows in batches.items():
         batch = oriented_batch([surfaces[n] for n in rows], count)
-        moved = jax.device_get(optimize_pose_graphs(batch, config.pose_graph.steps, config.motion))
-        for n, motions in zip(rows, moved, strict=False):  # without the batch's padding
+        optimized = partial(optimize_pose_graphs, steps=config.pose_graph.steps, motion=config.motion)
+        for n, motions in zip(rows, chunked(optimized, OBJECTS_A_CALL, batch), strict=True):
             result[n] = with_motions(objects[n], motions, max_turn_deg(surfaces[n]))
     return result
 
@@ -101,7 +105,7 @@ def max_turn_deg(surfaces: Sequence[ObservedSurface | None]) -> float:
 
 def oriented_batch(rows: Sequence[Sequence[ObservedSurface | None]], most: int) -> OrientedObservations:
     """Observations of several objects as one padded batch: `COMPARED_POINTS` each, `most` of an object."""
-    shape = (bucket(len(rows), SMALLEST_BATCH), most, COMPARED_POINTS)
+    shape = (len(rows), most, COMPARED_POINTS)
     points, normals = np.zeros((2, *shape, 3), np.float32)
     mask, residual = np.zeros(shape, bool), np.zeros(shape[0], np.float32)
     for n, row in enumerate(rows):

@@ -1,6 +1,7 @@
 """Registration of one pair of clouds (paper §3.3): starting poses, then descent or surface alignment; vmapped outside.
 
-`descent` is the paper's; `surface` aligns surfaces point-to-plane from many starts.
+`descent` is the paper's; `field` takes Gauss-Newton steps on both completed fields; `surface` aligns surfaces
+point-to-plane. The last two start all round.
 May import `network`, `geometry`, `config`, `types`.
 """
 

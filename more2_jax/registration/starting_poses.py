@@ -54,6 +54,17 @@ def candidate_rotations(source: Embedding, target: Embedding, turns: int, motion
     return jax.vmap(jaxlie.SO3.from_matrix)(matrices)
 
 
+def turned_rotations(source: Embedding, target: Embedding, turns: int, motion: MotionModel) -> jaxlie.SO3:
+    """The embeddings' rotation, and that rotation turned on: `turns` in all about the vertical (upright), or by the
+    60 rotations of an icosahedron; the first is the embeddings' own, upright the nearest turn about the vertical."""
+    by_code = kabsch_rotation(source.eqv.T, target.eqv.T)
+    if motion == "upright":
+        others, by_code = turns_about_vertical(turns), jaxlie.SO3.from_z_radians(yaw_of(by_code.as_matrix()))
+    else:
+        others = icosahedral_rotations()
+    return jax.vmap(lambda R: jaxlie.SO3.from_matrix(R) @ by_code)(jnp.asarray(others, source.eqv.dtype))
+
+
 def yaw_of(matrix: Float[Array, "*b 3 3"]) -> Float[Array, "*b"]:
     """The turn about the vertical nearest to each rotation, radians; 0 where all are as near."""
     return jnp.arctan2(matrix[..., 1, 0] - matrix[..., 0, 1], matrix[..., 0, 0] + matrix[..., 1, 1])

@@ -5,6 +5,15 @@ May import `tracking`, `geometry`, `config`, `progress`, `types`.
 
 from more2_jax.report.page import report_html, write_report
 from more2_jax.report.palette import color, rgb
-from more2_jax.report.wording import leveled_text, motion_text, repair_text
+from more2_jax.report.wording import leveled_text, motion_text, repair_text, upright_text
 
-__all__ = ["color", "leveled_text", "motion_text", "repair_text", "report_html", "rgb", "write_report"]
+__all__ = [
+    "color",
+    "leveled_text",
+    "motion_text",
+    "repair_text",
+    "report_html",
+    "rgb",
+    "upright_text",
+    "write_report",
+]

@@ -76,6 +76,21 @@ def motion_text(o: SceneObject, changes: Changes) -> str:
     return f"{v.status} {v.distance_m:.2f} m, {v.angle_deg:.1f}°"
 
 
+def upright_text(name: str, upright: bool, likely_up: str | None) -> str:
+    """How objects are taken to move, where the first scan decides it, and what to say if they move otherwise.
+
+    `likely_up`: axis of the scan, +x to -z; None where nothing points to one.
+    """
+    if upright:
+        return f"{name} shows a level floor: objects stay upright (--any-orientation if they do not)"
+    if likely_up in (None, "+z"):
+        return f"{name} shows no floor across z: objects may turn in any way (--upright if z is up and they do not)"
+    axis = likely_up.removeprefix("+")
+    return (
+        f"{name}: {likely_up} is likely up, not z: objects may turn in any way (--up {axis} if they do not)"
+    )
+
+
 def leveled_text(scene: LivingScene, scan: ScanRecord) -> str | None:
     """`friday: leveled by 3.2°`; None of a scan that was taken as given, or in a scene that is not upright."""
     tilt_deg = scan.frame.tilt_deg

@@ -35,6 +35,7 @@ class ReadOptions:
     masks: Path | None = None  # predicted masks beside the cloud (Mask3D)
     masks_needed: bool = True  # False: a cloud without masks is welcome, it is segmented afterwards
     depth_frames: bool = False  # points from the raw depth frames rather than from the mesh (3RScan)
+    up: str = "z"  # axis that is up in the file: x, y, z, -x, -y or -z
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,8 +10,7 @@ import numpy as np
 
 from more2_jax.scans.labeled_cloud import LabeledCloud, ReadOptions
 from more2_jax.scans.normal_sides import outward
-from more2_jax.scans.predicted_masks import lay_masks
-from more2_jax.scans.read_scan import UNITS_M, check_points, check_unit, read_cloud, scan_of, sensors_of
+from more2_jax.scans.read_scan import UNITS_M, check_points, check_told, read_masked, scan_of
 from more2_jax.scans.seen_empty import UnlabeledScan
 from more2_jax.scans.temporal_segmentation import TemporalSegmentation, segment_changes
 from more2_jax.types import Scan
@@ -34,7 +33,7 @@ class _File:
 
     def unlabeled(self) -> UnlabeledScan:
         """Its points in meters, whatever instances they have."""
-        sensors = sensors_of(self.path, self.cloud)
+        sensors = np.zeros((0, 3)) if self.cloud.sensors is None else self.cloud.sensors
         normals = self.cloud.normals
         if normals is not None:
             background = np.zeros(len(normals), np.int64)
@@ -53,6 +52,7 @@ def read_changed_scans(
     min_points: int = 64,
     min_score: float = 0.5,
     depth_frames: bool = False,
+    up: str = "z",
 ) -> tuple[Scan, ...]:
     """Scans of one room, without instances, cut by what changed between them (`segment_changes`).
 
@@ -61,7 +61,7 @@ def read_changed_scans(
     Raises ValueError, in one line, for fewer than two scans in all, for one that fits no other, where no instance is
     left, and for what `read_scan` refuses.
     """
-    check_unit(unit)
+    check_told(unit, up)
     every = [Path(p) for p in (*earlier, *paths)]
     if len(every) < 2 or len(masks) not in (0, len(paths)):
         raise ValueError(
@@ -69,13 +69,13 @@ def read_changed_scans(
             " masks or one a scan; --segment geometric cuts one scan alone"
         )
     beside = [None] * len(earlier) + [None if m is None else Path(m) for m in masks or [None] * len(paths)]
+    told = ReadOptions(
+        instance_property=instance_property, masks_needed=False, depth_frames=depth_frames, up=up
+    )
     files = []
     for path, mask in zip(every, beside, strict=True):
-        options = ReadOptions(
-            instance_property=instance_property, masks=mask, masks_needed=False, depth_frames=depth_frames
-        )
-        cloud = read_cloud(path, options)
-        cloud = cloud if mask is None else lay_masks(cloud, path, mask, min_score)
+        options = replace(told, masks=mask)
+        cloud = read_masked(path, options, min_score)
         check_points(path, cloud.points)
         files.append(_File(path=path, cloud=cloud, unit=unit))
     return tuple(

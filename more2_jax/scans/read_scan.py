@@ -9,6 +9,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float, Integer
 
+from more2_jax.geometry.up_axis import R_UP
 from more2_jax.scans.formats.registry import FORMATS, WITH_DEPTH_FRAMES
 from more2_jax.scans.geometric_segmentation import SegmentationConfig, segment_geometric
 from more2_jax.scans.labeled_cloud import CUT_WITHOUT, LabeledCloud, ReadOptions, one_line
@@ -36,6 +37,7 @@ def read_scan(
     min_score: float = 0.5,
     segment: Literal["changes", "geometric"] | None = None,
     depth_frames: bool = False,
+    up: str = "z",
 ) -> Scan:
     """Reads one scan: instances in meters (float64, the scan's own frame), and what was left out.
 
@@ -47,25 +49,21 @@ def read_scan(
     mm. Instances of fewer than `min_points` points are reported in `Scan.skipped`; sizes that look like another
     unit, in `Scan.warnings`. `masks` are predicted ones (`data.masks`): those scored `min_score` or more replace
     the scan's own. `segment="geometric"` cuts a cloud without instances into planes and clusters; `depth_frames`
-    reads the raw depth of 3RScan (paper §4). Normals are the file's, else those of its faces.
+    reads the raw depth of 3RScan (paper §4). Normals are the file's, else those of its faces. `up` names the axis
+    that is up in the file (x, y, z, -x, -y, -z): the scan is turned so that it is z.
 
     Raises ValueError, in one line, when the file is missing, unknown, damaged, has no instance property, has
     coordinates that are not finite, or no instance is left.
     """
     path = Path(path)
-    check_unit(unit)
+    check_told(unit, up)
     _check_alone(path, segment)
-    masks = None if masks is None else Path(masks)
-    needed = segment is None and masks is None
+    at, needed = None if masks is None else Path(masks), segment is None and masks is None
     options = ReadOptions(
-        instance_property=instance_property, masks=masks, masks_needed=needed, depth_frames=depth_frames
+        instance_property=instance_property, masks=at, masks_needed=needed, depth_frames=depth_frames, up=up
     )
-    cloud = read_cloud(path, options)
-    if masks is not None:
-        cloud = lay_masks(cloud, path, masks, min_score)
-    if segment is not None:
-        cloud = _segmented(path, cloud, unit)
-    return scan_of(path, cloud, unit, min_points)
+    cloud = read_masked(path, options, min_score)
+    return scan_of(path, cloud if segment is None else _segmented(path, cloud, unit), unit, min_points)
 
 
 def _check_alone(path: Path, segment: str | None) -> None:
@@ -96,8 +94,23 @@ def _segmented(path: Path, cloud: LabeledCloud, unit: str) -> LabeledCloud:
     )
 
 
+def read_masked(path: Path, options: ReadOptions, min_score: float) -> LabeledCloud:
+    """The cloud with the predicted masks, if there are any, those scored `min_score` or more, as its instances."""
+    cloud = read_cloud(path, options)
+    return cloud if options.masks is None else lay_masks(cloud, path, options.masks, min_score)
+
+
 def read_cloud(path: Path, options: ReadOptions) -> LabeledCloud:
-    """What the first format that recognizes the path reads, in the file's unit. Raises ValueError in one line."""
+    """What the first format that recognizes the path reads, in the file's unit, and its sensors; up is z.
+
+    Raises ValueError in one line.
+    """
+    cloud = _as_filed(path, options)
+    return turned_to_z(replace(cloud, sensors=_sensors(path, cloud)), options.up)
+
+
+def _as_filed(path: Path, options: ReadOptions) -> LabeledCloud:
+    """The cloud as its format reads it."""
     if not path.exists():
         raise ValueError(f"{path}: no such file or folder")
     for form in FORMATS:
@@ -119,10 +132,25 @@ def read_cloud(path: Path, options: ReadOptions) -> LabeledCloud:
     raise ValueError(f"{path}: {what}; needed a .ply, an .npz, or a folder of one .ply per object")
 
 
-def check_unit(unit: str) -> None:
-    """Raises ValueError for a unit that is none of `UNITS_M`."""
+def check_told(unit: str, up: str) -> None:
+    """Raises ValueError for a unit that is none of `UNITS_M`, and for what is no axis of `R_UP`."""
     if unit not in UNITS_M:
         raise ValueError(f"unit {unit!r}; needed m, cm or mm")
+    if up not in R_UP:
+        raise ValueError(f"up {up!r}; needed {', '.join(R_UP)}")
+
+
+def turned_to_z(cloud: LabeledCloud, up: str) -> LabeledCloud:
+    """The cloud with another of its axes as z; to the bit as it is where z is up."""
+    if up == "z":
+        return cloud
+
+    def turned(rows: Float[np.ndarray, "n 3"] | None) -> Float[np.ndarray, "n 3"] | None:
+        return None if rows is None else rows @ R_UP[up].T
+
+    return replace(
+        cloud, points=cloud.points @ R_UP[up].T, normals=turned(cloud.normals), sensors=turned(cloud.sensors)
+    )
 
 
 def check_points(path: Path, points: Float[np.ndarray, "n 3"]) -> None:
@@ -149,7 +177,7 @@ def scan_of(path: Path, cloud: LabeledCloud, unit: str, min_points: int) -> Scan
         )
     check_points(path, cloud.points)
     points = cloud.points * UNITS_M[unit]
-    sensors = sensors_of(path, cloud)
+    sensors = np.zeros((0, 3)) if cloud.sensors is None else cloud.sensors
     background = points[cloud.instance <= 0]
     normals, turned = _outward_normals(cloud, cloud.instance, sensors)
     kept, skipped = _instances(replace(cloud, normals=normals), cloud.instance, points, min_points)
@@ -177,7 +205,7 @@ def _outward_normals(
     return normals, said
 
 
-def sensors_of(path: Path, cloud: LabeledCloud) -> Float[np.ndarray, "s 3"]:
+def _sensors(path: Path, cloud: LabeledCloud) -> Float[np.ndarray, "s 3"]:
     """Where the scan's sensors stood: what `<scan>.sensors.txt` beside it says, else what the scan itself says.
 
     A line a place, x y z as the scan's points. None (0 rows) where neither says. Raises ValueError, in one line,

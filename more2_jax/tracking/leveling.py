@@ -10,11 +10,26 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from more2_jax.geometry.gravity import gravity
+from more2_jax.geometry.gravity import gravity, least_turn, stand_on_floor
 from more2_jax.geometry.poses import Points, Pose, apply_pose, turned
+from more2_jax.geometry.up_axis import likely_up_axis
 from more2_jax.types import Frame, Instance, Observation, Scan, SceneObject
 
 LEAST_TILT_DEG = 0.5  # a smaller tilt is left alone: clean scans stay as they are
+
+
+def shows_floor(scan: Scan) -> bool:
+    """Whether a scan's z is up, to some degrees, by a floor on which all it shows stands.
+
+    It is then taken that things turn about the vertical only. A wall at the end of a scan that lies on its side is no
+    floor: another axis is likelier up.
+    """
+    found = gravity(scan.background)
+    if found is None:
+        return False
+    points = np.concatenate([scan.background, *(i.points for i in scan.instances)])
+    likely, _ = likely_up_axis(points @ least_turn(found.up).T)
+    return likely in ("+z", None) and stand_on_floor(points, found.up)
 
 
 def level_of(background: Points, T_level_first: Pose | None = None) -> Pose:

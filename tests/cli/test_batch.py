@@ -15,6 +15,7 @@ from more2_jax import scene
 from more2_jax.cli import batch
 from more2_jax.cli.main import main
 from more2_jax.cli.manifest import RottenRow, SceneJob, read_manifest
+from more2_jax.cli.options import Reading
 from more2_jax.storage.scene_folder import load_scene
 from more2_jax.workers.dealing import Desk
 
@@ -176,29 +177,29 @@ def test_other_settings_are_not_mixed_in(place, tiny, inline, capsys):
 
 def test_the_cells_of_a_row_are_the_options_of_run(place, tiny):
     columns = (
-        "name, scans, out, masks, preset, upright, prior, keep_masks, config, unit, segment, depth_frames"
+        "name, scans, out, masks, preset, upright, prior, keep_masks, config, unit, segment, up, depth_frames"
     )
-    row = f"x, a.ply; {place}/b.ply, deep/er, b.ply;a.ply, paper, yes, {tiny.name}, 1, quick.yaml, mm, geometric, no"
+    row = f"x, a.ply; {place}/b.ply, d/er, b.ply;a.ply, paper, yes, {tiny.name}, 1, quick.yaml, mm, geometric, -y, no"
     path = written(place, tiny, row, columns=columns)
     (place / tiny.name).write_bytes(tiny.read_bytes())
     (job,) = read_manifest(path, place / "out")
     assert isinstance(job, SceneJob)
     assert job.scans == (place / "a.ply", place / "b.ply") and job.masks == (place / "b.ply", place / "a.ply")
-    assert job.out == place / "out/deep/er" and job.prior == str(place / tiny.name)
-    assert (job.reading.unit, job.reading.segment, job.reading.depth_frames) == ("mm", "geometric", False)
+    assert job.out == place / "out/d/er" and job.prior == str(place / tiny.name)
+    assert job.reading == Reading(unit="mm", segment="geometric", up="-y", depth_frames=False)
     config = job.settings()
     assert (config.preset, config.upright, config.repair_masks, config.meshing.resolution) == (
         "paper", True, False, 16,
     )  # fmt: skip
     (plain,) = read_manifest(written(place, tiny, "x,a.ply"), place / "out")
     assert isinstance(plain, SceneJob)
-    assert (plain.preset, plain.upright, plain.masks, plain.out) == ("robust", False, (), place / "out/x")
+    assert (plain.preset, plain.upright, plain.masks, plain.out) == ("robust", None, (), place / "out/x")
 
 
 @pytest.mark.parametrize(
     ("cells", "says"),
     [
-        ("x,a.ply,sideways,,", "got 'sideways'; needed one of robust, paper"),
+        ("x,a.ply,sideways,,", "got 'sideways'; needed one of robust, field, paper"),
         ("x,a.ply,,maybe,", "got 'maybe'; needed true or false"),
         ("x,,,,", "no scans; needed one"),
         (",a.ply,,,", "no name; needed one"),

@@ -15,7 +15,7 @@ from rich.table import Table
 from more2_jax.cli import living_scenes as building
 from more2_jax.cli.main import main
 from more2_jax.config import preset
-from more2_jax.report import report_html
+from more2_jax.report import report_html, upright_text
 from more2_jax.storage.scene_folder import load_scene, save_scene
 
 
@@ -60,6 +60,33 @@ def test_demo_runs_on_the_bundled_scans_and_ends_with_the_truth(tmp_path, capsys
     assert all(path.is_file() for path in paths)
     assert config == preset("robust", upright=True)
     assert capsys.readouterr().out.splitlines()[-1] == "5 right"
+
+
+@pytest.mark.parametrize(
+    ("option", "upright"), [([], None), (["--upright"], True), (["--any-orientation"], False)]
+)
+def test_the_first_scan_says_how_objects_move_unless_the_user_does(tmp_path, monkeypatch, option, upright):
+    asked = []
+    monkeypatch.setattr(building, "run_scans", lambda *args, **_: asked.append(args))
+    assert main(["run", "a.ply", "b.ply", "--out", str(tmp_path / "room"), *option]) == 0
+    assert asked[0][2] == preset("robust", upright=upright)
+
+
+@pytest.mark.parametrize(
+    ("upright", "likely_up", "says"),
+    [
+        (True, "+z", "a shows a level floor: objects stay upright (--any-orientation if they do not)"),
+        (
+            False,
+            None,
+            "a shows no floor across z: objects may turn in any way (--upright if z is up and they do not)",
+        ),
+        (False, "+y", "a: +y is likely up, not z: objects may turn in any way (--up y if they do not)"),
+        (False, "-z", "a: -z is likely up, not z: objects may turn in any way (--up -z if they do not)"),
+    ],
+)
+def test_what_was_settled_is_said_with_the_way_out(upright, likely_up, says):
+    assert upright_text("a", upright, likely_up) == says
 
 
 @pytest.mark.parametrize(("option", "repaired"), [([], True), (["--keep-masks"], False)])

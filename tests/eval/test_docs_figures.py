@@ -69,6 +69,21 @@ def test_one_run_shows_all_methods_and_the_best_in_bold(docs):
     assert "old" not in made and RESULTS["command"] in made
 
 
+def test_one_run_of_many_methods_has_a_line_a_method(docs):
+    made = with_tables(ONE.replace("median RE", "median RE; lines = methods"), docs / "figures")
+    assert "| ours, robust | **80.0** (79.0 to 81.0) | 2.00 (1.00 to 3.00) |" in made
+    assert "| RANSAC | 75.0 (74.0 to 76.0) |  |" in made and "| GICP | 70.0" in made
+
+
+def test_ours_is_the_preset_of_the_run_whatever_its_variants_reach(docs):
+    """The first method; the best of its variants would be chosen with the result in view."""
+    better = row("MR", "strict", "ours, robust, otherwise", 99.0)
+    results = RESULTS | {"rows": [*RESULTS["rows"], better]}
+    (docs / "runs" / "a" / "results.json").write_text(json.dumps(results), encoding="utf-8")
+    main(docs / "runs" / "a", "a", docs)
+    assert "| **80.0** / 75.0 |" in with_tables(TWO, docs / "figures")
+
+
 def test_several_runs_show_ours_beside_the_best_peer(docs):
     made = with_tables(TWO, docs / "figures")
     assert made.count("| **80.0** / 75.0 | 2.00 / **1.00** | 2, 0 | 2026-11-25 |") == 2

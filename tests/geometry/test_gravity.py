@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from more2_jax.geometry.gravity import gravity, least_turn
+from more2_jax.geometry.gravity import gravity, least_turn, stand_on_floor
 from more2_jax.geometry.poses import apply_pose
 
 NOTHING = np.zeros((0, 3))
@@ -195,3 +195,25 @@ def test_ends_of_furniture_without_a_floor_tilt_nothing(seed, pieces):
         parts.append(((points + [0, 0, 0.5]) * size) @ turn.T + rng.uniform([0, 0, 0], [5, 4, 0]))
     found = gravity(np.concatenate(parts))
     assert found is None or found.tilt_deg < 0.5
+
+
+UP = np.array([0.0, 0.0, 1.0])
+
+
+@pytest.mark.parametrize("kind", ["plain", "no walls", "walls dominate", "ceiling and tables"])
+def test_a_room_stands_on_its_floor_and_not_on_its_ceiling(kind):
+    points = room(kind)
+    assert stand_on_floor(points, UP)
+    if kind != "no walls":  # which alone says nothing of what is above
+        assert not stand_on_floor(points[points[:, 2] > 0.1], UP)
+    assert not stand_on_floor(apply_pose(np.diag([1.0, -1.0, -1.0, 1.0]), room("plain")), UP)
+
+
+def test_what_lies_below_the_floor_must_be_little():
+    points = room("plain")
+    below = (
+        points[: len(points) // 10] * [1.0, 1.0, 0.0]
+        - [0.0, 0.0, 1.0] * np.linspace(0.2, 3.0, len(points) // 10)[:, None]
+    )
+    assert stand_on_floor(np.concatenate([points, below[::4]]), UP)
+    assert not stand_on_floor(np.concatenate([points, below]), UP)

@@ -11,7 +11,7 @@ import pieces
 import pytest
 from compiling import quick_jit
 
-from more2_jax.config import DescentRegistration, SurfaceRegistration, SurfaceSearch
+from more2_jax.config import DescentRegistration, FieldRegistration, SurfaceRegistration, SurfaceSearch
 from more2_jax.network.prior import encode
 from more2_jax.registration.pair_batch import batch_of, pair_up
 from more2_jax.registration.register_pairs import register
@@ -21,6 +21,7 @@ pytestmark = pytest.mark.quickly
 COUNT = 64
 MASK = np.ones((2, COUNT), bool)  # closed over by what is compiled
 DESCENT = DescentRegistration(points=32, sdf_points=32, steps=5, icp_steps=2)
+FIELD = FieldRegistration(search_points=16, search_steps=2, points=32, steps=3)
 SURFACE = SurfaceRegistration(
     search=SurfaceSearch(points=32, dense=64, cells=8, keep=2, steps=4),
     points=32,
@@ -91,6 +92,32 @@ def test_gradient_through_encoder_kabsch_and_refinement_agrees_with_finite_diffe
                 along = float(jnp.vdot(gradient, way))
                 assert along == pytest.approx(float(slope), rel=1e-3)
                 assert float(forward) == pytest.approx(along, rel=1e-6)
+
+
+def test_gradient_through_steps_on_the_fields_agrees_with_finite_differences(tiny_prior, clouds):
+    """In float64 and over differences so small that they cross no kink of a ReLU, where a field's slope jumps."""
+    rng = np.random.default_rng(0)
+    with jax.enable_x64(True):
+        params = jax.tree.map(lambda x: jnp.asarray(x, jnp.float64), tiny_prior.params)
+        prior = dataclasses.replace(tiny_prior, params=params)
+        source, target = (jnp.asarray(x) for x in clouds)
+        codes, loss = codes_of(prior, source, target), loss_with(FIELD, start(10.0))
+
+        def of_one(x):
+            return loss(x, target, prior, codes)
+
+        @quick_jit
+        def slopes(x, way):
+            value, gradient = jax.value_and_grad(of_one)(x)
+            return value, jnp.vdot(gradient, way), jax.jvp(of_one, (x,), (way,))[1]
+
+        for _ in range(3):
+            way, eps = jnp.asarray(rng.normal(size=source.shape)), 1e-8
+            after, before = (float(slopes(source + s * way, way)[0]) for s in (eps, -eps))
+            _, along, forward = map(float, slopes(source, way))
+            assert abs(along) > 1e-4
+            assert along == pytest.approx((after - before) / (2 * eps), rel=1e-3)
+            assert forward == pytest.approx(along, rel=1e-6)
 
 
 METHODS = {

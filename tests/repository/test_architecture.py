@@ -15,7 +15,7 @@ import pytest
 from places import ROOT
 
 LIBRARY = ROOT / "more2_jax"
-PACKAGES = ("more2_jax", "train", "eval")
+PACKAGES = ("more2_jax", "train", "eval", "docs_build")
 LONGEST_FILE, LONGEST_FUNCTION = 400, 40  # lines
 STAGES = ("geometry", "network", "registration", "matching", "tracking", "meshing", "refinement")
 # Weights are files: these alone read and write any.

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from more2_jax.scans.inspection import format_report, inspect_scan, likely_up_axis
+from more2_jax.geometry.up_axis import likely_up_axis
+from more2_jax.scans.inspection import format_report, inspect_scan
 from more2_jax.types import Instance, Scan, Skipped
 
 RNG = np.random.default_rng(0)

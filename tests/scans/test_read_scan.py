@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from plyfile import PlyData, PlyElement
 
+from more2_jax.geometry.up_axis import R_UP
 from more2_jax.scans.read_scan import read_scan
 
 RNG = np.random.default_rng(0)
@@ -151,6 +152,29 @@ def test_meters_read_as_millimeters_warn(tmp_path):
 
 
 # --- bad input: one line each, saying what, got, needed -----------------------------------------------------
+
+
+@pytest.mark.parametrize("up", ["x", "y", "z", "-x", "-y", "-z"])
+def test_the_axis_that_is_up_in_the_file_is_z_in_the_scan(tmp_path, up):
+    R = R_UP[up]
+    axis = np.eye(3)["xyz".index(up[-1])] * (-1 if up[0] == "-" else 1)
+    np.testing.assert_array_equal(R @ axis, [0, 0, 1])
+    np.testing.assert_array_equal(R @ R.T, np.eye(3))
+    assert np.linalg.det(R) == pytest.approx(1.0)
+    normals, sensors = np.tile([0.0, 0.6, 0.8], (len(POINTS), 1)), [[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]]
+    standing = {"points": POINTS, "normals": normals, "sensors": sensors}
+    for name, turned in (("standing", np.eye(3)), ("lying", R.T)):
+        rows = {k: np.asarray(v) @ turned.T for k, v in standing.items()}
+        np.savetxt(tmp_path / f"{name}.sensors.txt", rows.pop("sensors"))
+        np.savez(tmp_path / f"{name}.npz", instance=IDS, **rows)
+    told = read_scan(tmp_path / "standing.npz", unit="cm")
+    found = read_scan(tmp_path / "lying.npz", unit="cm", up=up)
+    np.testing.assert_allclose(found.background, told.background, atol=1e-12)
+    np.testing.assert_allclose(found.sensors, told.sensors, atol=1e-12)
+    for a, b in zip(found.instances, told.instances, strict=True):
+        np.testing.assert_allclose(a.points, b.points, atol=1e-12)
+        np.testing.assert_allclose(a.normals, b.normals, atol=1e-12)
+    assert "up 'w'; needed x, y, z, -x, -y, -z" in fails(tmp_path / "lying.npz", up="w")
 
 
 def fails(path: Path, **kwargs) -> str:

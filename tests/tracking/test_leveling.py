@@ -12,11 +12,12 @@ from small_scenes import CONFIG, in_frame, room, scan
 
 from more2_jax.config import preset
 from more2_jax.geometry.poses import apply_pose
+from more2_jax.geometry.up_axis import R_UP
 from more2_jax.meshing.object_mesh import object_floor
 from more2_jax.scene import add_scan, leveled_scan, start_scene
 from more2_jax.tracking import leveling
 from more2_jax.tracking.accumulated import accumulated_object
-from more2_jax.tracking.leveling import LEAST_TILT_DEG, as_given, level_of, leveled
+from more2_jax.tracking.leveling import LEAST_TILT_DEG, as_given, level_of, leveled, shows_floor
 from more2_jax.tracking.objects import place_of, points_of
 from more2_jax.tracking.relocalize import known_object
 from more2_jax.types import Frame, LivingScene, Scan
@@ -189,3 +190,32 @@ def test_a_leveled_scan_turned_about_the_vertical_keeps_its_tilt():
     T = turn_z(1.0, np.zeros(3), np.ones(3)) @ tilt(A, 7.0, 30.0)
     assert Frame(T_scene_scan=T).tilt_deg == pytest.approx(7.0)
     assert Frame().tilt_deg == Frame(T_scene_scan=turn_z(1.0, np.zeros(3), np.ones(3))).tilt_deg == 0.0
+
+
+OPEN = dataclasses.replace(CONFIG, upright=None)
+
+
+@pytest.mark.parametrize("tilt_deg", [0.0, 5.0])
+def test_where_nobody_says_a_level_floor_has_things_stay_upright(tiny_prior, tilt_deg):
+    first = in_frame(A, tilt(A, tilt_deg, 20.0))
+    made = add_scan(tiny_prior, start_scene(tiny_prior, first, OPEN), B, OPEN)
+    told = add_scan(tiny_prior, start_scene(tiny_prior, first, CONFIG), B, CONFIG)
+    assert made.upright and told.upright
+    for a, b in zip(made.objects, told.objects, strict=True):
+        assert np.array_equal(a.observations[-1].T_ref_scan, b.observations[-1].T_ref_scan)
+
+
+@pytest.mark.parametrize("shown", [NOTHING, A.background[A.background[:, 2] > FLOOR_M + 0.2]])
+def test_without_a_floor_they_may_turn_in_any_way(tiny_prior, shown):
+    bare = dataclasses.replace(A, background=shown)
+    assert not shows_floor(bare)
+    assert not start_scene(tiny_prior, bare, OPEN).upright
+
+
+@pytest.mark.parametrize("up", ["x", "y", "-x", "-y", "-z"])
+def test_a_scan_on_its_side_shows_no_floor(up):
+    assert shows_floor(A)
+    T = np.eye(4)
+    T[:3, :3] = R_UP[up].T
+    lying = in_frame(A, T)
+    assert not shows_floor(lying)
