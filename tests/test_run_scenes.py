@@ -45,7 +45,9 @@ def test_each_scene_is_what_it_is_alone(tiny_prior, together, n):
     expected, found = alone(tiny_prior, SCENES[n]), together[n]
     assert [o.id for o in found.objects] == [o.id for o in expected.objects]
     for a, b in zip(expected.objects, found.objects, strict=True):
-        assert [(s.scan, s.instance) for s in a.observations] == [(s.scan, s.instance) for s in b.observations]
+        assert [(s.scan, s.instance) for s in a.observations] == [
+            (s.scan, s.instance) for s in b.observations
+        ]
         for s, t in zip(a.observations, b.observations, strict=True):
             np.testing.assert_allclose(t.T_ref_scan, s.T_ref_scan, atol=1e-5)
         np.testing.assert_allclose(b.embedding.inv, a.embedding.inv, atol=1e-5)

@@ -31,7 +31,9 @@ from more2_jax.types import AccumulatedObject
 SURFACE_POINTS, COMPARED_POINTS = 8192, 1024
 MAX_OBSERVATIONS = 32  # of an object: its first, and the last of the others; more stay as registered
 MIN_OBSERVATIONS = 4  # of the padded batch: objects seen two to four times share one compiled program
-OBJECTS_A_CALL = 1  # optimized together: on a CPU one after the other, so that nothing is worked on to fill a call
+OBJECTS_A_CALL = (
+    1  # optimized together: on a CPU one after the other, so that nothing is worked on to fill a call
+)
 # Poses are made better here, not found: among noise an observation that would turn farther has slipped along the
 # others (docs/relocalization.md has a table of such limits).
 MAX_TURN_DEG = 3.0
