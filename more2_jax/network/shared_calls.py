@@ -22,7 +22,8 @@ import jax
 import numpy as np
 
 Tree = Any  # of arrays
-Item, Result = TypeVar("Item"), TypeVar("Result")
+Item = TypeVar("Item")
+Result = TypeVar("Result")
 
 SCENES_TOGETHER = 32  # that are held in memory side by side; each is some 30 MB with its scans
 

@@ -126,17 +126,27 @@ def views_of(objects: Sequence[SceneObject], pairs: set[tuple[int, int]], scan: 
 
 def lost_to_neighbors(views: Sequence[View]) -> list[Border]:
     """Points that the other scans do not show on their object, but on another one that goes on beside them."""
-    borders = []
-    for v in views:
+    borders, meeting = [], boxes_meet(views)
+    for v, met in zip(views, meeting, strict=True):
         free = off(v.own, v.others, v.reach_m) > v.reach_m
         lost = list[Border]()
-        for w in (w for w in views if w is not v):
+        for w in (w for w, m in zip(views, met, strict=True) if m and w is not v):
             if (b := lost_to(v, free, w)) is not None:
                 lost.append(b)
                 free &= ~b.rows
         if sum(len(b.points) for b in lost) <= MOST_DROPPED * len(v.own):
             borders += lost
     return borders
+
+
+def boxes_meet(views: Sequence[View]) -> Bool[np.ndarray, "v v"]:
+    """Whether the mask of one view (row) may have points within reach of what the others show of another (column)."""
+    if not views:
+        return np.zeros((0, 0), bool)
+    low, high = (np.stack([f(v.own, axis=0) for v in views])[:, None] for f in (np.min, np.max))
+    there, beyond = (np.stack([f(v.others, axis=0) for v in views]) for f in (np.min, np.max))
+    reach = np.array([v.reach_m for v in views])[:, None]
+    return np.all((low <= beyond + reach) & (high >= there - reach), axis=-1)
 
 
 def lost_to(v: View, free: Rows, w: View) -> Border | None:
@@ -196,7 +206,8 @@ def off(points: Points, cloud: Points, reach_m: float) -> Distances:
     """How far points lie off a cloud; infinite beyond a reach."""
     distance = np.full(len(points), np.inf)
     box = ((points >= cloud.min(axis=0) - reach_m) & (points <= cloud.max(axis=0) + reach_m)).all(axis=1)
-    distance[box] = KDTree(cloud).query(points[box], distance_upper_bound=reach_m)[0]
+    if box.any():
+        distance[box] = KDTree(cloud).query(points[box], distance_upper_bound=reach_m)[0]
     return distance
 
 
