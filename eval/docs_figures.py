@@ -13,6 +13,7 @@ many methods. Several: a line a run, ours / the best peer.
 from __future__ import annotations
 
 import json
+import math
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -123,10 +124,8 @@ def of_one(kept: dict[str, Any], shown: Sequence[str]) -> list[str]:
     lines = [row_of(["", *methods]), row_of(["---"] * (len(methods) + 1))]
     for figure in shown:
         rows = rows_of(kept, figure)
-        best = max((SENSE[r["better"]] * r["value"] for r in rows.values()), default=0.0)
-        cells = [
-            cell(r, SENSE[r["better"]] * r["value"] >= best) if (r := rows.get(m)) else "" for m in methods
-        ]
+        best = max(map(worth, rows.values()), default=0.0)
+        cells = [cell(r, worth(r) >= best) if (r := rows.get(m)) else "" for m in methods]
         unit = next(iter(rows.values()))["unit"] if rows else ""
         lines.append(row_of([f"{figure} [{unit}]", *cells]))
     date = kept["date"][:10]
@@ -136,7 +135,7 @@ def of_one(kept: dict[str, Any], shown: Sequence[str]) -> list[str]:
 def of_methods(kept: dict[str, Any], shown: Sequence[str]) -> list[str]:
     """A line a method, with intervals; a column a figure."""
     tables = {figure: rows_of(kept, figure) for figure in shown}
-    best = {f: max(SENSE[r["better"]] * r["value"] for r in rows.values()) for f, rows in tables.items()}
+    best = {f: max(map(worth, rows.values())) for f, rows in tables.items()}
     units = {f: next(iter(rows.values()))["unit"] for f, rows in tables.items()}
     lines = [
         row_of(["", *(f"{f} [{unit}]" for f, unit in units.items())]),
@@ -144,7 +143,7 @@ def of_methods(kept: dict[str, Any], shown: Sequence[str]) -> list[str]:
     ]
     for method in dict.fromkeys(r["method"] for r in kept["rows"]):
         found = [(rows.get(method), best[f]) for f, rows in tables.items()]
-        cells = [cell(r, SENSE[r["better"]] * r["value"] >= most) if r else "" for r, most in found]
+        cells = [cell(r, worth(r) >= most) if r else "" for r, most in found]
         lines.append(row_of([method, *cells]))
     facts = [f"`{kept['command']}`", kept["date"][:10], f"{kept['rows'][0]['scenes']} rooms"]
     return [*lines, "", f"{', '.join(facts)}, {max(r['count'] for r in kept['rows'])} pairs."]
@@ -171,9 +170,14 @@ def against_best(rows: dict[str, dict[str, Any]]) -> str:
     """Ours / the best of the others, the better one bold, or both."""
     others = [r for m, r in rows.items() if not m.startswith(OURS)]
     ours = [r for m, r in rows.items() if m.startswith(OURS)][:1]  # the run's own preset, not its variants
-    chosen = [max(side, key=lambda r: SENSE[r["better"]] * r["value"]) for side in (ours, others) if side]
-    best = max((SENSE[r["better"]] * r["value"] for r in chosen), default=0.0)
-    return " / ".join(bold(number(r["value"]), SENSE[r["better"]] * r["value"] >= best) for r in chosen)
+    chosen = [max(side, key=worth) for side in (ours, others) if side]
+    best = max(map(worth, chosen), default=0.0)
+    return " / ".join(bold(number(r["value"]), worth(r) >= best) for r in chosen)
+
+
+def worth(row: dict[str, Any]) -> float:
+    """More is better. None at all where too many fail for a median."""
+    return -math.inf if row["value"] is None else SENSE[row["better"]] * row["value"]
 
 
 def cell(row: dict[str, Any], best: bool) -> str:
@@ -184,8 +188,10 @@ def cell(row: dict[str, Any], best: bool) -> str:
     return text + (f"; {row['failures']} failed" if row["failures"] else "")
 
 
-def number(value: float) -> str:
-    """Three digits."""
+def number(value: float | None) -> str:
+    """Three digits; none where more than half fail."""
+    if value is None:
+        return "none"
     return f"{value:.1f}" if abs(value) >= 10 else f"{value:.2f}"
 
 
