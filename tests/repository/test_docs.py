@@ -22,6 +22,7 @@ def jit_quickly(function, of: str, jit, **options):
     return jit(function, **options, **({"compiler_options": QUICKLY} if function.__module__ == of else {}))
 
 
+@pytest.mark.slow
 def test_the_gradient_example_gives_a_finite_gradient(monkeypatch):
     names: dict[str, object] = {"__name__": "snippet"}
     monkeypatch.setattr(jax, "jit", partial(jit_quickly, of=str(names["__name__"]), jit=jax.jit))

@@ -75,15 +75,18 @@ def test_a_chair_is_found_again(printed):
     assert "converged: True" in text
 
 
+@pytest.mark.slow
 def test_a_scene_in_few_lines_names_what_came_and_went(printed):
     text = printed(2)
     assert "scan 0 to 1: 5 moved, 1 static, added object_007, removed object_003" in text
 
 
+@pytest.mark.slow
 def test_the_gradient_agrees_with_finite_differences(printed):
     assert number_after("relative difference:", printed(3)) < 1e-3
 
 
+@pytest.mark.slow
 def test_a_hundred_pairs_are_registered(printed):
     assert number_after("share below 5°:", printed(4)) > 0.7
 
