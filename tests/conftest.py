@@ -1,7 +1,9 @@
 """JAX on the CPU in full precision, shapes of every signature checked, and the smallest prior there is."""
 
+import gc
 import os
 from contextlib import nullcontext
+from pathlib import Path
 
 os.environ["JAX_PLATFORMS"] = "cpu"
 
@@ -21,6 +23,9 @@ jax.config.update("jax_default_matmul_precision", "highest")
 from page_browser import browser, common, opened, opener, report, said  # noqa: E402, F401
 
 
+MOST_MAPS = 20_000  # two files of tests add no more than another 30,000
+
+
 @pytest.fixture(scope="session")
 def tiny_prior():
     """Random weights in the smallest configuration."""
@@ -37,6 +42,19 @@ def pytest_runtest_protocol(item):
     """Tests marked `quickly` compile so, their fixtures included."""
     with quickly() if item.get_closest_marker("quickly") else nullcontext():
         return (yield)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def forgotten_programs():
+    """Drops compiled programs between files where there are many.
+
+    On CPUs each takes memory maps, of which Linux gives a process 65,530: beyond, compiling crashes.
+    """
+    yield
+    maps = Path("/proc/self/maps")
+    if maps.exists() and len(maps.read_text().splitlines()) > MOST_MAPS:
+        jax.clear_caches()
+        gc.collect()
 
 
 @pytest.fixture
