@@ -22,7 +22,6 @@ jax.config.update("jax_default_matmul_precision", "highest")
 # One browser for all tests of the page; after the hook, for it imports more2_jax.
 from page_browser import browser, common, opened, opener, report, said  # noqa: E402, F401
 
-
 MOST_MAPS = 20_000  # two files of tests add no more than another 30,000
 
 
