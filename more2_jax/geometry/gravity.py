@@ -25,15 +25,14 @@ LEAST_POINTS = 200
 LEAST_WIDTH_M = (
     0.15  # standard deviation of the levels' points, the narrower way: of a strip half a meter wide
 )
-# Of the points about the fullest level so many lie within `SCALE_M`: clutter lies at any height.
+# Of the points about a floor or a ceiling so many lie within `SCALE_M`: clutter lies at any height.
 LEAST_THIN = 0.5
 # Floors and ceilings are at the ends of a room; tops of furniture, whose edges masks leave, have legs below and lamps
 # above them. Levels at an end hold so much of the fullest.
 LEAST_AT_END = 0.6
 LEAST_GAIN = 1.1  # levels hold so many times what they hold along z, or up is z
-MOST_BEYOND = (
-    0.05  # share of a scan below its floor, or above its ceiling: noise, a stair seen through a door
-)
+# Share of a scan below its floor, or above its ceiling: noise, a stair seen through a door.
+MOST_BEYOND = 0.05
 REACH_M = 50.0  # along an axis: a stray point a kilometer off must not make a million layers
 TRIED_POINTS = 5000  # at even steps, along the directions tried
 MOST_POINTS = 20_000  # at even steps, for the rest

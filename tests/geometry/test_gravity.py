@@ -197,6 +197,19 @@ def test_ends_of_furniture_without_a_floor_tilt_nothing(seed, pieces):
     assert found is None or found.tilt_deg < 0.5
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_a_rough_floor_is_one_and_table_tops_alone_are_none(seed):
+    rng = np.random.default_rng(seed)
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_rotvec([np.deg2rad(3.0), 0, 0]).as_matrix()
+    rough = floor(rng, 4000) + [0.0, 0.0, 0.018] * rng.normal(size=(4000, 3))
+    found = gravity(apply_pose(T, np.concatenate([rough, walls(rng, 3000), clutter(rng, 1000)])))
+    assert found is not None and found.tilt_deg == pytest.approx(3.0, abs=0.5)
+    top, below = box(rng, 3000, (1, 1, 0.75), (4, 3, 0.75)), box(rng, 1500, (1, 1, 0), (4, 3, 0.7))
+    above = box(rng, 1500, (1, 1, 0.8), (4, 3, 1.6))
+    assert gravity(apply_pose(T, np.concatenate([top, below, above]))) is None
+
+
 UP = np.array([0.0, 0.0, 1.0])
 
 
