@@ -6,7 +6,6 @@ import dataclasses
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Self
 
 import numpy as np
 from jaxtyping import Int
@@ -43,7 +42,7 @@ class Comparison:
         new: Sequence[ObservedObject],
         identified: Identified,
         config: SceneConfig,
-    ) -> Self | None:
+    ) -> Comparison | None:
         """The comparison; None where nothing is known of surfaces (`CodeMatcher`)."""
         if not isinstance(config.matching, EvidenceMatcher) or identified.aligned is None:
             return None

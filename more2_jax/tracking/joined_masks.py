@@ -20,6 +20,7 @@ from more2_jax.geometry.poses import Points, apply_pose
 from more2_jax.geometry.transform import transform
 from more2_jax.matching.color import color_of
 from more2_jax.network.embedding_batch import embed
+from more2_jax.network.prior import Prior
 from more2_jax.tracking.accumulated import embed_accumulated
 from more2_jax.tracking.comparison import Comparison
 from more2_jax.tracking.objects import place_of
@@ -29,7 +30,7 @@ from more2_jax.types import Instance, ObservedObject, Repair, SceneObject
 
 # Chosen on rooms of regimes `paper`, `sparse` and `real`, docs/developing/notebook/mask_repair.md.
 TOUCHING = 2.0  # distances between neighboring points: parts of one surface lie no farther apart
-LEAST_TOUCHING = 10  # points that lie so near the other cloud, of both
+LEAST_TOUCHING = 0.5  # of as many points as a line across the smaller has: that many of both lie so near the other
 LEAST_ON = 0.3  # share of a part that must lie on the other scan's object, which may be a part itself
 LIKELY = 1.0  # log odds beyond an even chance: what is so likely an object of its own
 LEAST_GAIN = 1.0  # is joined where both together are so much likelier than the likelier of them
@@ -144,7 +145,7 @@ class ObjectParts(Parts):
 
 def join_parts(whole: Regrouped, compared: Comparison) -> Regrouped | None:
     """Joins instances that are one object known before, and objects that are one instance; None if there are none."""
-    pairs = [(f.object, f.instance) for f in compared.identified.found]
+    prior, pairs = compared.prior, [(f.object, f.instance) for f in compared.identified.found]
     of_instances = InstanceParts(
         compared=compared,
         partner={i: k for k, i in pairs},
@@ -161,15 +162,17 @@ def join_parts(whole: Regrouped, compared: Comparison) -> Regrouped | None:
     ).joins()
     if not of_instances and not of_objects:
         return None
-    return with_instances_joined(with_objects_joined(whole, of_objects, compared), of_instances, compared)
+    return with_instances_joined(with_objects_joined(whole, of_objects, prior), of_instances, prior)
 
 
 def touch(one: Points, other: Points) -> bool:
-    """Whether two clouds are parts of one surface: as near one another as their points are."""
+    """Whether two clouds are parts of one surface: along a line, as near one another as their points are."""
+    one, other = np.unique(one, axis=0), np.unique(other, axis=0)  # points given twice lie no nearer
     tree, there = KDTree(one), KDTree(other)
     spacing = np.median(np.concatenate([t.query(t.data, k=2)[0][:, 1] for t in (tree, there)]))
     near = [t.query(p, distance_upper_bound=TOUCHING * spacing)[0] for t, p in ((tree, other), (there, one))]
-    return sum(int(np.isfinite(d).sum()) for d in near) >= LEAST_TOUCHING
+    across = min(len(one), len(other)) ** 0.5
+    return sum(int(np.isfinite(d).sum()) for d in near) >= LEAST_TOUCHING * across
 
 
 def each_once(found: Sequence[Join]) -> list[Join]:
@@ -182,7 +185,7 @@ def each_once(found: Sequence[Join]) -> list[Join]:
     return kept
 
 
-def with_objects_joined(whole: Regrouped, joins: Sequence[Join], compared: Comparison) -> Regrouped:
+def with_objects_joined(whole: Regrouped, joins: Sequence[Join], prior: Prior) -> Regrouped:
     """The larger of two objects keeps its id, unless it was seen once and the smaller more often."""
     objects, repairs, parts, wholes = list(whole.objects), list(whole.repairs), set[int](), list[int]()
     for j in joins:
@@ -193,13 +196,13 @@ def with_objects_joined(whole: Regrouped, joins: Sequence[Join], compared: Compa
         repairs.append(Repair(object=objects[first].id, absorbed=(objects[second].id,), share=j.share))
         parts.add(second)
         wholes.append(first)
-    objects = embed_accumulated(compared.prior, objects, wholes)
+    objects = embed_accumulated(prior, objects, wholes)
     return dataclasses.replace(
         whole, objects=[o for k, o in enumerate(objects) if k not in parts], repairs=tuple(repairs)
     )
 
 
-def with_instances_joined(whole: Regrouped, joins: Sequence[Join], compared: Comparison) -> Regrouped:
+def with_instances_joined(whole: Regrouped, joins: Sequence[Join], prior: Prior) -> Regrouped:
     """The larger of two instances keeps its id."""
     instances, embeddings, parts = list(whole.instances), list(whole.embeddings), set[int]()
     masks = list(whole.joined)
@@ -207,7 +210,7 @@ def with_instances_joined(whole: Regrouped, joins: Sequence[Join], compared: Com
         first, second = sorted((j.matched, j.part), key=lambda i: -len(instances[i].points))
         masks.append(JoinedMask(instances=(instances[first].id, instances[second].id), share=j.share))
         instances[first] = joined(instances[first], [instances[second]])
-        (embeddings[first],) = embed(compared.prior, [instances[first].points], [instances[first].normals])
+        (embeddings[first],) = embed(prior, [instances[first].points], [instances[first].normals])
         parts.add(second)
     kept = [i for i in range(len(instances)) if i not in parts]
     return dataclasses.replace(
