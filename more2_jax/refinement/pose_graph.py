@@ -128,8 +128,7 @@ def normal_equations(
     count, size, _ = points.shape
     features = jnp.concatenate([points, NORMAL_SCALE * normals], axis=-1)
     others = jnp.asarray(mask & (jnp.arange(count) != k)[:, None]).reshape(-1)
-    # Of an object seen twice, three quarters of the rows are padding or the observation's own.
-    there = nearest_index(features[k], features.reshape(-1, 6), others, runs=True)
+    there = nearest_index(features[k], features.reshape(-1, 6), others)
     whose, own, gap = there // size, points[k], points.reshape(-1, 3)[there] - points[k]
     other = normals.reshape(-1, 3)[there]
     agree = jnp.sum(normals[k] * other, axis=-1)
