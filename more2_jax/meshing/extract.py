@@ -37,7 +37,10 @@ MAX_LEVEL = 0.1  # canonical units: a field that is farther off at observed poin
 # caches (2,048 take 0.6 times as long as 8,192 at a time); accelerators want large products where there is much to ask.
 CHUNK = 2048
 ACCELERATOR_CHUNK = 32768
-SURE_CELLS = 1.0  # of a field whose value is so many steps of its grid, few points change the sign
+GRADIENT_CHUNK = (
+    512  # the same of gradients on CPUs, which are asked at few points of a cloud seen by one scan
+)
+SURE_CELLS = 0.6  # of a field whose value is so many steps of its grid, few points change the sign
 SAMPLES = CHUNK  # points at most where the field's level, and its gradient, are asked
 
 # Of one object at `CHUNK` points. Differences of values instead of a gradient would spare a compilation, but at the
@@ -107,7 +110,8 @@ def observed_surface(
     points = canonical(embedding, uniform_subsample(observed))
     eyes = None if sensors is None else canonical(embedding, uniform_subsample(sensors))
     asked = uniform_subsample(points, SAMPLES)
-    gradient = _in_chunks(_field_gradients, prior, embedding, asked)[KDTree(asked).query(points)[1]]
+    slopes = _in_chunks(_field_gradients, prior, embedding, asked, GRADIENT_CHUNK)
+    gradient = slopes[KDTree(asked).query(points)[1]]
     sides = None if normals is None else uniform_subsample(normals)
     return fit_observed_surface(points, gradient, config.mls_bandwidth, lowest, eyes, sides)
 
@@ -141,13 +145,16 @@ def _in_chunks(
     prior: Prior,
     embedding: Embedding,
     queries: Points,
+    chunk: int = CHUNK,
 ) -> Float[np.ndarray, "p *_"]:
-    """What a program gives at canonical offsets, asked for in chunks of a fixed size: one for few, one for many."""
+    """What a program gives at canonical offsets, asked for in chunks of a fixed size: `chunk` on CPUs.
+
+    On accelerators one for few, one for many.
+    """
     local = dataclasses.replace(embedding, origin=np.zeros(3, np.float32))
     points = (queries * float(embedding.scale) + np.asarray(embedding.center)).astype(np.float32)
-    chunk = CHUNK
-    if len(points) > CHUNK and jax.default_backend() != "cpu":
-        chunk = ACCELERATOR_CHUNK
+    if jax.default_backend() != "cpu":
+        chunk = ACCELERATOR_CHUNK if len(points) > CHUNK else CHUNK
     padded = np.zeros((-(-max(len(points), 1) // chunk) * chunk, 3), np.float32)
     padded[: len(points)] = points
     parts = [program(prior, local, part) for part in padded.reshape(-1, chunk, 3)]

@@ -44,8 +44,8 @@ class ObservedSurface:
     tree: KDTree  # of the points the planes belong to
     center: Points  # of each plane: its points' mean, which has less of their noise, or the point where there is none
     normal: Points  # unit length, outward
-    area: Float[np.ndarray, " _"]  # the share of the surface that each stands for
-    neighbors: Int[np.ndarray, "_ k"]  # of every point, nearest first
+    distance: Float[np.ndarray, "_ k"]  # of every point to its neighbors, nearest first,
+    neighbors: Int[np.ndarray, "_ k"]  # and which these are
     bandwidth: float  # off a plane, at this distance, its weight has fallen to 1/e
     gap: float  # and along it, at this distance from the nearest point: it also holds between neighbors
     residual: float  # how far off the planes their points lie, typically
@@ -128,7 +128,8 @@ class ObservedSurface:
 
     def screened(self, field: Grid, lattice: Lattice, length: float, margin: float) -> Grid:
         """The field on a lattice, inside and outside corrected near the points; `length`: how far that reaches."""
-        return screened_poisson(field, lattice, self.points, self.normal, self.area, length, margin)
+        area = surface_areas(self.points, self.normal, self.distance, self.neighbors)
+        return screened_poisson(field, lattice, self.points, self.normal, area, length, margin)
 
 
 def uniform_subsample(rows: Real[np.ndarray, "n *_"], most: int = MAX_POINTS) -> Real[np.ndarray, "m *_"]:
@@ -165,5 +166,4 @@ def fit_observed_surface(
     gap = GAP_SPACINGS * max(float(np.median(distance[:, 1])), MIN_GAP)
     signs = outward_signs(tree, normal, slope, gap, lowest, sensors, (distance, neighbors), normals)
     normal = signs[:, None] * normal
-    area = surface_areas(points, normal, distance, neighbors)
-    return ObservedSurface(tree, center, normal, area, neighbors, bandwidth, gap, residual, noiseless)
+    return ObservedSurface(tree, center, normal, distance, neighbors, bandwidth, gap, residual, noiseless)
