@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import time
 
+import jax
 import numpy as np
 import pytest
 from factories import scene_object, turn_z
@@ -223,6 +224,35 @@ def test_another_scene_compiles_nothing_new(tiny_prior, scene):
     other = start_scene(tiny_prior, scan("d", {0: (2.0, 0.0), 1: (0.0, 3.0), 2: (1.0, 7.0)}), CONFIG)
     add_scan(tiny_prior, other, scan("e", {0: (1.0, 1.0), 2: (0.5, 6.0)}), CONFIG)
     assert min(before) >= 1 and [p._cache_size() for p in programs] == before
+
+
+def test_scenes_of_other_sizes_compile_not_the_smallest_program(tiny_prior):
+    """Programs stay in memory: a process that works on thousands of scenes would meet limits, and compiles are slow."""
+    config, compiled = dataclasses.replace(CONFIG, joint=JointConfig(steps=0)), []
+
+    def note(event, duration, **_):
+        compiled.append(event.endswith("backend_compile_duration"))
+
+    def build(name, *visits):
+        made = start_scene(tiny_prior, scan(f"{name} 0", visits[0]), config)
+        for k, visit in enumerate(visits[1:], start=1):
+            made = add_scan(tiny_prior, made, scan(f"{name} {k}", visit), config)
+        reconstruct(tiny_prior, made, config)
+
+    here, there, far = {0: (0.0, 0.0)}, {1: (1.0, 3.0)}, {2: (0.5, 7.0)}
+    jax.monitoring.register_event_duration_secs_listener(note)
+    try:
+        jax.jit(lambda x: x + 1)(0)
+        assert sum(compiled)  # it is noted
+        build("warm", here | there, here | there | far)
+        compiled.clear()
+        for n, visits in enumerate(
+            [(here, here), (here | there | far,) * 2, (here, there | here, far | there)]
+        ):
+            build(str(n), *visits)
+        assert not sum(compiled)
+    finally:
+        jax.monitoring.unregister_event_duration_listener(note)
 
 
 def test_one_scan_alone_is_a_scene_without_changes(tiny_prior):

@@ -26,6 +26,7 @@ from rich.progress import (
 from rich.progress import Progress as Bars
 from rich.table import Table
 
+from more2_jax.cli.damaged_programs import replace_damaged_programs
 from more2_jax.cli.options import Reporting
 from more2_jax.progress import STAGES, Progress
 
@@ -183,3 +184,4 @@ def keep_compiled_programs() -> None:
         jax.config.update("jax_compilation_cache_dir", str(cache_folder()))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+    replace_damaged_programs()

@@ -9,6 +9,7 @@ from scipy.spatial import KDTree
 from more2_jax.geometry.poses import Points
 
 CELL_M = 1.0  # a side: about as many points in a cell as cells in a room
+TOUCHING_M = 1e-6  # apart by rounding
 RADIUS_M = CELL_M * np.sqrt(3) / 2  # of the ball that holds a cell
 # Makes one number of a cell; a million cells either way along each axis
 SIDES = np.array([1 << 42, 1 << 21, 1])
@@ -20,7 +21,7 @@ class NearPoints:
     def __init__(self, points: Points) -> None:
         cell = np.floor(points / CELL_M).astype(np.int64)
         order = np.argsort(cell @ SIDES, kind="stable")
-        self._points = points[order]
+        self._given, self._order, self._points = points, order, points[order]
         _, first = np.unique((cell @ SIDES)[order], return_index=True)
         self._ends = np.append(first, len(points))
         self._center = (cell[order[first]] + 0.5) * CELL_M
@@ -54,3 +55,10 @@ class NearPoints:
         """All points of some cells."""
         parts = [self._points[self._ends[c] : self._ends[c + 1]] for c in cells.tolist()]
         return np.concatenate(parts) if parts else self._points[:0]
+
+    def around_box(self, low: Float[np.ndarray, "3"], high: Float[np.ndarray, "3"]) -> Points:
+        """The points of a box, and some beside it, in the order in which they were given."""
+        apart = np.abs(self._center - (low + high) / 2) - (high - low) / 2
+        cells = np.flatnonzero((apart <= CELL_M / 2 + TOUCHING_M).all(axis=1))
+        parts = [self._order[self._ends[c] : self._ends[c + 1]] for c in cells.tolist()]
+        return self._given[np.sort(np.concatenate(parts))] if parts else self._given[:0]

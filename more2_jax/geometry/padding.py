@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
@@ -46,9 +47,10 @@ def pad_clouds(
     turned = None
     if normals is not None:
         known = [_directions(n, len(c), i) for i, (n, c) in enumerate(zip(normals, whole, strict=True))]
-        turned = jnp.asarray(np.stack([n[_kept(len(n))][o] for n, o in zip(known, orders, strict=True)]))
-    points = jnp.asarray(np.stack(rows).astype(np.float32))
-    return PointCloud(points=points, mask=jnp.asarray(masks), origin=origins, normals=turned)
+        turned = np.stack([n[_kept(len(n))][o] for n, o in zip(known, orders, strict=True)])
+    # Placed, not converted by jnp: that compiles a program for every number of clouds.
+    points, mask, turned = jax.device_put((np.stack(rows).astype(np.float32), masks, turned))
+    return PointCloud(points=points, mask=mask, origin=origins, normals=turned)
 
 
 def _kept(count: int) -> np.ndarray:

@@ -99,12 +99,19 @@ def nearest_index(
         key = (jax.lax.bitcast_convert_type(squared, jnp.int32) & ~low) | row[:, None]
         return jnp.minimum(best, jnp.where(real[:, None], key, last).min(axis=0)), None
 
+    def nearer_if_any(
+        best: Int[Array, " n"], some: tuple[Array, Array, Array]
+    ) -> tuple[Int[Array, " n"], None]:
+        # Clouds are filled up to one size; what is padding is skipped, unless masks are mapped over.
+        return jax.lax.cond(some[1].any(), nearer, lambda best, _: (best, None), best, some)
+
     # The whole matrix of keys would be written to memory and read again, and takes five times as long.
     at_once = min(ROWS_AT_ONCE, len(b)) if jax.default_backend() == "cpu" else len(b)
     rows = (b, b_mask, jnp.arange(len(b), dtype=jnp.int32))
     blocks = [jnp.pad(x, ((0, -len(b) % at_once), *[(0, 0)] * (x.ndim - 1))) for x in rows]
     blocks = [x.reshape(-1, at_once, *x.shape[1:]) for x in blocks]
-    best, _ = jax.lax.scan(nearer, jnp.full(len(a), last, jnp.int32), (blocks[0], blocks[1], blocks[2]))
+    start = jnp.full(len(a), last, jnp.int32)
+    best, _ = jax.lax.scan(nearer_if_any, start, (blocks[0], blocks[1], blocks[2]))
     return jnp.minimum(best & low, len(b) - 1)
 
 

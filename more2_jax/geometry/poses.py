@@ -44,13 +44,21 @@ def world_poses(
     Origins may be shared by several poses: they broadcast.
     """
     T = np.zeros((*local.wxyz_xyz.shape[:-1], 4, 4))
-    quaternion = np.asarray(local.rotation().wxyz, np.float64)
+    quaternion, shift = np.split(on_host(local), (4,), axis=-1)
     R = Rotation.from_quat(quaternion.reshape(-1, 4), scalar_first=True).as_matrix()
     T[..., :3, :3] = R.reshape(*quaternion.shape[:-1], 3, 3)
     turned = np.einsum("...ij,...j->...i", T[..., :3, :3], source_origin)
-    T[..., :3, 3] = np.asarray(local.translation(), np.float64) + target_origin - turned
+    T[..., :3, 3] = shift + target_origin - turned
     T[..., 3, 3] = 1.0
     return T
+
+
+def on_host(T: jaxlie.SE3) -> Float[np.ndarray, "*batch 7"]:
+    """Quaternions (w, x, y, z) and translations of poses, float64.
+
+    jaxlie's own accessors are programs, of which every number of poses would compile some.
+    """
+    return np.asarray(T.wxyz_xyz, np.float64)
 
 
 def local_poses(

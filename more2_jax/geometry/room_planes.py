@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.spatial import KDTree
 
+from more2_jax.geometry.near_points import NearPoints
 from more2_jax.geometry.poses import Points
 
 # Chosen on rooms of regime `real`, docs/developing/notebook/mask_repair.md.
@@ -55,8 +56,11 @@ class RoomPlane:
         return np.abs(points @ self.normal - self.offset_m) < 2 * OFF_M
 
 
-def room_planes(cloud: Points, background: Points, room: Points) -> list[RoomPlane]:
-    """The planes that bound the room around a cloud; `room` is all of the scan, `background` what is no object."""
+def room_planes(cloud: Points, background: Points | NearPoints, room: Points | NearPoints) -> list[RoomPlane]:
+    """The planes that bound the room around a cloud; `room` is all of the scan, `background` what is no object.
+
+    By cells (`NearPoints`) where many clouds are asked about.
+    """
     tree = KDTree(cloud)
     near, around = (within(tree, p, AROUND_M) for p in (background, room))
     wide = (p for p in planes_of(near) if is_wide(p.points) and goes_on(p, tree))
@@ -121,14 +125,16 @@ def behind(plane: RoomPlane, room: Points) -> float:
     return float(min((height < -BEHIND_M).mean(), (height > BEHIND_M).mean()))
 
 
-def within(tree: KDTree, points: Points, reach_m: float) -> Points:
+def within(tree: KDTree, points: Points | NearPoints, reach_m: float) -> Points:
     """The points that lie so near those of a tree, in their order.
 
     Asked of the tree is only what lies in the box around it: scans of a building have a hundred times as much.
     """
+    low, high = tree.mins - BOX_SLACK * reach_m, tree.maxes + BOX_SLACK * reach_m
+    if isinstance(points, NearPoints):
+        points = points.around_box(low, high)
     for axis in range(3):
-        low, high = tree.mins[axis] - BOX_SLACK * reach_m, tree.maxes[axis] + BOX_SLACK * reach_m
-        points = points[(points[:, axis] >= low) & (points[:, axis] <= high)]
+        points = points[(points[:, axis] >= low[axis]) & (points[:, axis] <= high[axis])]
     return points[np.isfinite(tree.query(points, distance_upper_bound=reach_m)[0])]
 
 

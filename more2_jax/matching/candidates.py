@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from more2_jax.config import EvidenceMatcher, MotionModel, SurfaceSearch
-from more2_jax.geometry.poses import Pose, local_poses, world_poses
+from more2_jax.geometry.poses import Pose, local_poses, on_host, world_poses
 from more2_jax.matching.assignment import LogOdds, listed_at
 from more2_jax.matching.calibration import Compared, calibrated
 from more2_jax.matching.color import color_evidence
@@ -229,8 +229,7 @@ def evidence_at(
 ) -> PairEvidence:
     """What the best pose of every pair says, upright at a common height."""
     found, radius = aligned.found, np.asarray(aligned.ready[1].radius)[aligned.rows[:, 0]]
-    z = np.asarray(found.poses.translation()[..., 2])
-    stayed = np.asarray(aligned.stayed.translation()[..., 2])[:, None]
+    z, stayed = on_host(found.poses)[..., 6], on_host(aligned.stayed)[:, None, 6]
     lift = np.abs(z - stayed - (height_m - aligned.height_m))
     best = np.zeros(len(z), int)  # as they are ordered
     if motion == "upright":

@@ -16,7 +16,16 @@ from skimage.measure import marching_cubes
 
 from more2_jax.config import MeshingConfig
 from more2_jax.geometry.poses import Points
-from more2_jax.meshing.grid import GridField, Lattice, cube, surface_cells, upsampled
+from more2_jax.meshing.grid import (
+    Grid,
+    GridField,
+    Lattice,
+    Mask,
+    crossed_corners,
+    cube,
+    surface_cells,
+    upsampled,
+)
 from more2_jax.meshing.observed_surface import ObservedSurface, fit_observed_surface, uniform_subsample
 from more2_jax.network.prior import Prior, sdf_one
 from more2_jax.types import Embedding, Mesh
@@ -28,6 +37,10 @@ MAX_LEVEL = 0.1  # canonical units: a field that is farther off at observed poin
 # caches (2,048 take 0.6 times as long as 8,192 at a time); accelerators want large products where there is much to ask.
 CHUNK = 2048
 ACCELERATOR_CHUNK = 32768
+GRADIENT_CHUNK = (
+    512  # the same of gradients on CPUs, which are asked at few points of a cloud seen by one scan
+)
+SURE_CELLS = 0.6  # of a field whose value is so many steps of its grid, few points change the sign
 SAMPLES = CHUNK  # points at most where the field's level, and its gradient, are asked
 
 # Of one object at `CHUNK` points. Differences of values instead of a gradient would spare a compilation, but at the
@@ -97,7 +110,8 @@ def observed_surface(
     points = canonical(embedding, uniform_subsample(observed))
     eyes = None if sensors is None else canonical(embedding, uniform_subsample(sensors))
     asked = uniform_subsample(points, SAMPLES)
-    gradient = _in_chunks(_field_gradients, prior, embedding, asked)[KDTree(asked).query(points)[1]]
+    slopes = _in_chunks(_field_gradients, prior, embedding, asked, GRADIENT_CHUNK)
+    gradient = slopes[KDTree(asked).query(points)[1]]
     sides = None if normals is None else uniform_subsample(normals)
     return fit_observed_surface(points, gradient, config.mls_bandwidth, lowest, eyes, sides)
 
@@ -131,13 +145,16 @@ def _in_chunks(
     prior: Prior,
     embedding: Embedding,
     queries: Points,
+    chunk: int = CHUNK,
 ) -> Float[np.ndarray, "p *_"]:
-    """What a program gives at canonical offsets, asked for in chunks of a fixed size: one for few, one for many."""
+    """What a program gives at canonical offsets, asked for in chunks of a fixed size: `chunk` on CPUs.
+
+    On accelerators one for few, one for many.
+    """
     local = dataclasses.replace(embedding, origin=np.zeros(3, np.float32))
     points = (queries * float(embedding.scale) + np.asarray(embedding.center)).astype(np.float32)
-    chunk = CHUNK
-    if len(points) > CHUNK and jax.default_backend() != "cpu":
-        chunk = ACCELERATOR_CHUNK
+    if jax.default_backend() != "cpu":
+        chunk = ACCELERATOR_CHUNK if len(points) > CHUNK else CHUNK
     padded = np.zeros((-(-max(len(points), 1) // chunk) * chunk, 3), np.float32)
     padded[: len(points)] = points
     parts = [program(prior, local, part) for part in padded.reshape(-1, chunk, 3)]
@@ -187,7 +204,7 @@ def _screened(
     With half the step, or the step `finest` if the points have so little noise; of the box alone that holds what is
     inside and what was observed.
     """
-    held = coarse.lattice.corners_near(surface.points, 0.0)
+    held = coarse.lattice.corners_near(surface.points, 0.5 * coarse.lattice.step)
     length = (surface.noiseless and config.screening_length_multi_scan) or config.screening_length
     # The same space around it for either length: more costs time and, measured, changes nothing.
     margin = config.screening_length
@@ -198,9 +215,36 @@ def _screened(
         lattice, field = lattice.finer(), upsampled(field)
     below = lowest - lattice.low[2] - lattice.step * np.arange(lattice.shape[2])
     field = surface.screened(np.maximum(field, below), lattice, length, margin)
+    final = lattice.step < 1.5 * finest
+    return GridField(lattice, field, _drawn_near(surface, lattice, field, below, final))
+
+
+def _drawn_near(
+    surface: ObservedSurface, lattice: Lattice, field: Grid, below: Float[np.ndarray, " k"], final: bool
+) -> Grid:
+    """The field on a lattice drawn toward what was observed, and positive below a height.
+
+    `final`: only the corners of cells that the surface crosses need be exact, of the others the sign. Most corners are
+    then farther off than a sign can change.
+    """
     near, values = lattice.corners_near(surface.points, surface.cutoff), field.copy()
-    values[near] = surface.corrected(lattice.at(np.argwhere(near)), field[near])
-    return GridField(lattice, field, np.maximum(values, below))
+
+    def draw(asked: Mask, reach: float = np.inf) -> None:
+        values[asked] = surface.corrected(lattice.at(np.argwhere(asked)), field[asked], reach)
+
+    if not final:
+        draw(near)
+        return np.maximum(values, below)
+    least = SURE_CELLS * lattice.step
+    reach, sure = surface.sign_reach(least), np.abs(field) >= least
+    exact = near & ~sure
+    draw(exact)
+    draw(near & sure & lattice.corners_near(surface.points, reach), reach)
+    drawn = np.maximum(values, below)
+    # At the border the surface is closed by values that are not of this field.
+    open_ended = any((np.take(drawn, (0, -1), axis=axis) < 0).any() for axis in range(3))
+    draw(near & ~exact if open_ended else near & ~exact & crossed_corners(drawn))
+    return np.maximum(values, below)
 
 
 def _marching_cubes(found: GridField, embedding: Embedding) -> Mesh:

@@ -13,6 +13,8 @@ Grid = Float[np.ndarray, "i j k"]
 Mask = Bool[np.ndarray, "i j k"]
 Points = Float[np.ndarray, "p 3"]
 
+ROUNDING = 1e-6  # of a step, by which a corner may seem to lie farther off
+
 
 @dataclass(frozen=True)
 class Lattice:
@@ -36,11 +38,15 @@ class Lattice:
 
     def corners_near(self, points: Points, distance: float) -> Mask:
         """Corners within `distance` of a point, and some a little farther off."""
-        corner = np.rint((points - self.low) / self.step).astype(int)
-        held = corner[((corner >= 0) & (corner < self.shape)).all(axis=1)]
-        holds = np.zeros(self.shape, bool)
+        # A point is half a step off the corner nearest to it, at most, along each axis.
+        reach = int(distance / self.step + 0.5 + ROUNDING)
+        corner = np.rint((points - self.low) / self.step).astype(int) + reach
+        size = np.add(self.shape, 2 * reach)  # points beside the lattice are near its corners, too
+        held = corner[((corner >= 0) & (corner < size)).all(axis=1)]
+        holds = np.zeros(size, bool)
         holds[tuple(held.T)] = True
-        return maximum_filter(holds, size=2 * int(np.ceil(distance / self.step + 0.5)) + 1)
+        inside = tuple(slice(reach, reach + n) for n in self.shape)
+        return maximum_filter(holds, size=2 * reach + 1)[inside]
 
 
 @dataclass(frozen=True)
@@ -95,3 +101,21 @@ def surface_cells(values: Grid, step: float) -> Bool[np.ndarray, "i-1 j-1 k-1"]:
     straddles = (corners.min(axis=0) < 0) & (corners.max(axis=0) >= 0)
     close = np.abs(corners).min(axis=0) < 0.5 * np.sqrt(3) * step
     return binary_dilation(straddles) | close
+
+
+def crossed_corners(values: Grid) -> Mask:
+    """The corners of all cells whose corners differ in sign."""
+    some = every = values < 0
+    for axis in range(3):
+        some, every = (_joined(x, axis, f) for x, f in ((some, np.logical_or), (every, np.logical_and)))
+    crossed = np.pad(some & ~every, 1)
+    for axis in range(3):
+        crossed = _joined(crossed, axis, np.logical_or)
+    return crossed
+
+
+def _joined(x: Mask, axis: int, with_next: np.ufunc) -> Bool[np.ndarray, "_ _ _"]:
+    """Every value with the next along an axis."""
+    first, second = [slice(None)] * 3, [slice(None)] * 3
+    first[axis], second[axis] = slice(None, -1), slice(1, None)
+    return with_next(x[tuple(first)], x[tuple(second)])

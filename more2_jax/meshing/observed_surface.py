@@ -32,6 +32,8 @@ GAP_SPACINGS = 3.0  # a plane holds this many median point distances along it
 MIN_GAP = 1e-3  # where points are doubled
 RESOLVED_RESIDUAL = 0.15  # share of a grid's step: points rougher than this do not resolve it
 CUTOFF = 1.5  # bandwidths off a plane, and gaps along it, beyond which it has no weight
+QUERIES_AT_ONCE = 1024  # measured together: what is known of their planes stays in the caches
+NOT_FACING = 1e-30  # a cosine that is none, or negative
 FACING_POWER = 4  # of the cosine to the nearest plane's normal: the other face of a thin board has no weight
 
 
@@ -42,8 +44,8 @@ class ObservedSurface:
     tree: KDTree  # of the points the planes belong to
     center: Points  # of each plane: its points' mean, which has less of their noise, or the point where there is none
     normal: Points  # unit length, outward
-    area: Float[np.ndarray, " _"]  # the share of the surface that each stands for
-    neighbors: Int[np.ndarray, "_ k"]  # of every point, nearest first
+    distance: Float[np.ndarray, "_ k"]  # of every point to its neighbors, nearest first,
+    neighbors: Int[np.ndarray, "_ k"]  # and which these are
     bandwidth: float  # off a plane, at this distance, its weight has fallen to 1/e
     gap: float  # and along it, at this distance from the nearest point: it also holds between neighbors
     residual: float  # how far off the planes their points lie, typically
@@ -63,42 +65,71 @@ class ObservedSurface:
         """Whether the points have so little noise that a grid of this step has something to tell."""
         return self.residual < RESOLVED_RESIDUAL * step
 
-    def corrected(self, queries: Points, field: Float[np.ndarray, " _"]) -> Float[np.ndarray, " _"]:
-        """Field values at queries, drawn toward the signed distance from the planes; canonical units."""
+    def corrected(
+        self, queries: Points, field: Float[np.ndarray, " _"], reach: float = np.inf
+    ) -> Float[np.ndarray, " _"]:
+        """Field values at queries, drawn toward the signed distance from the planes; canonical units.
+
+        Queries farther than `reach` from all points are left as they are, as those beyond `cutoff` always.
+        """
         result = np.array(field, np.float64)
         # Most of a grid is out of reach, and stays as it is.
-        distance, nearest = self.tree.query(queries, distance_upper_bound=self.cutoff)
+        distance, nearest = self.tree.query(queries, distance_upper_bound=min(reach, self.cutoff))
         near = np.flatnonzero(distance < np.inf)
         if not len(near):
             return result
-        offset = queries[near] - self.points[nearest[near]]
-        normal, toward, height, facing = np.split(self.query_planes[nearest[near]], (3, 6, 7), axis=2)
-        signed = np.einsum("qi,qki->qk", offset, normal) + height[..., 0]
-        squared = ((offset[:, None] - toward) ** 2).sum(axis=2)
-        weight = np.exp(-0.5 * (squared - squared[:, :1]) / self.gap**2) * facing[..., 0]
-        plane = (weight * signed).sum(axis=1) / weight.sum(axis=1)
-        # Flat at first: a field whose surface is a centimeter off must not draw this one toward it.
-        along = np.maximum(squared[:, 0] - plane**2, 0.0)
-        share = np.exp(-((plane / self.bandwidth) ** 4) - (along / self.gap**2) ** 2)
-        result[near] += share * (plane - result[near])
+        for start in range(0, len(near), QUERIES_AT_ONCE):
+            some = near[start : start + QUERIES_AT_ONCE]
+            result[some] = self._toward_planes(queries[some], nearest[some], result[some])
         return result
 
+    def _toward_planes(
+        self, queries: Points, nearest: Int[np.ndarray, " q"], field: Float[np.ndarray, " q"]
+    ) -> Float[np.ndarray, " q"]:
+        """`corrected` of queries within reach, `nearest` to these points."""
+        x, y, z = (queries - self.points[nearest]).T
+        planes = np.take(self.query_planes, nearest, axis=2)
+        signed, weight = (p[0] * x + p[1] * y + p[2] * z + p[3] for p in (planes[:4], planes[4:]))
+        np.exp(weight, out=weight)
+        plane = (weight * signed).sum(axis=0) / weight.sum(axis=0)
+        # Flat at first: a field whose surface is a centimeter off must not draw this one toward it.
+        along = np.maximum(x**2 + y**2 + z**2 - plane**2, 0.0)
+        share = np.exp(-((plane / self.bandwidth) ** 4) - (along / self.gap**2) ** 2)
+        return field + share * (plane - field)
+
+    def sign_reach(self, least: float) -> float:
+        """So far from all points, at most, a field whose absolute value is `least` or more can change its sign.
+
+        The result lies between the field and the height over the planes. Of opposite sign it is only where that height
+        h has a share s ≥ f / (f + h), which bounds first h and then, given h, the distance along the planes.
+        """
+        height = np.linspace(0.0, 2.0 * self.bandwidth, 1000)
+        left = np.log1p(height / least) - (height / self.bandwidth) ** 4
+        reach = np.where(left >= 0, height**2 + self.gap**2 * np.sqrt(np.maximum(left, 0.0)), 0.0)
+        return float(np.sqrt(reach.max())) + float(height[1])
+
     @cached_property
-    def query_planes(self) -> Float[np.ndarray, "n k 8"]:
+    def query_planes(self) -> Float[np.ndarray, "8 k n"]:
         """Of every point, the planes that a query nearest to it is measured to: its own, and those of its neighbors.
 
-        Normal, offset to the neighbor, height of the point over the neighbor's plane, how far the two face alike.
+        Two linear functions of a query's offset from the point, each as x, y, z and constant: the height over the
+        plane, and the logarithm of its weight, where near ones count and those that face as the point's own does; up
+        to what is the same for all planes.
         """
-        near = self.neighbors[:, : QUERY_PLANES_NOISELESS if self.noiseless else QUERY_PLANES].copy()
-        near[:, 0] = np.arange(len(near))  # where points are doubled, the first may be another
-        normal, toward = self.normal[near], self.points[near] - self.points[:, None]
-        height = np.einsum("nki,nki->nk", normal, self.points[:, None] - self.center[near])
-        facing = np.maximum(np.einsum("nki,ni->nk", normal, self.normal), 0.0) ** FACING_POWER
-        return np.concatenate([normal, toward, np.stack([height, facing], axis=2)], axis=2)
+        near = self.neighbors[:, : QUERY_PLANES_NOISELESS if self.noiseless else QUERY_PLANES].T.copy()
+        near[0] = np.arange(near.shape[1])  # where points are doubled, the first may be another
+        normal, toward = self.normal[near], self.points[near] - self.points
+        height = np.einsum("kni,kni->kn", normal, self.points - self.center[near])
+        facing = np.einsum("kni,ni->kn", normal, self.normal)
+        facing = FACING_POWER * np.log(np.maximum(facing, NOT_FACING))
+        closeness = facing - 0.5 * (toward**2).sum(axis=2) / self.gap**2
+        parts = [*np.moveaxis(normal, 2, 0), height, *np.moveaxis(toward, 2, 0) / self.gap**2, closeness]
+        return np.stack(parts)
 
     def screened(self, field: Grid, lattice: Lattice, length: float, margin: float) -> Grid:
         """The field on a lattice, inside and outside corrected near the points; `length`: how far that reaches."""
-        return screened_poisson(field, lattice, self.points, self.normal, self.area, length, margin)
+        area = surface_areas(self.points, self.normal, self.distance, self.neighbors)
+        return screened_poisson(field, lattice, self.points, self.normal, area, length, margin)
 
 
 def uniform_subsample(rows: Real[np.ndarray, "n *_"], most: int = MAX_POINTS) -> Real[np.ndarray, "m *_"]:
@@ -135,5 +166,4 @@ def fit_observed_surface(
     gap = GAP_SPACINGS * max(float(np.median(distance[:, 1])), MIN_GAP)
     signs = outward_signs(tree, normal, slope, gap, lowest, sensors, (distance, neighbors), normals)
     normal = signs[:, None] * normal
-    area = surface_areas(points, normal, distance, neighbors)
-    return ObservedSurface(tree, center, normal, area, neighbors, bandwidth, gap, residual, noiseless)
+    return ObservedSurface(tree, center, normal, distance, neighbors, bandwidth, gap, residual, noiseless)

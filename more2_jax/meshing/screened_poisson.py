@@ -17,7 +17,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.fft import irfftn, next_fast_len, rfftn
+from scipy.fft import fft, ifft, irfft, next_fast_len, rfft
 
 from more2_jax.meshing.grid import Grid, Lattice, Points
 
@@ -53,27 +53,56 @@ def screened_poisson(
         2 * np.pi * f(n, step)
         for f, n in zip((np.fft.fftfreq, np.fft.fftfreq, np.fft.rfftfreq), size, strict=True)
     ]
-    wavenumbers = np.meshgrid(*(x.astype(np.float32) for x in k), indexing="ij", sparse=True)
-    squared = wavenumbers[0] ** 2 + wavenumbers[1] ** 2 + wavenumbers[2] ** 2
+    x, y, z = np.meshgrid(*(x.astype(np.float32) for x in k), indexing="ij", sparse=True)
+    squared = x**2 + (y**2 + z**2)
     # Both gradients as smooth as the grid can hold, or as the points are dense.
     width = max(step, np.sqrt(float(np.median(area))))
-    flux = splat(points, -area[:, None] * normals, lattice)
-    divergence = sum(w * fourier(v, size) for w, v in zip(wavenumbers, flux, strict=True))
-    change = squared * gaussian(wavenumbers, step) * fourier(prior, size)
-    change += np.complex64(1j) * gaussian(wavenumbers, width) * divergence
-    change = np.asarray(irfftn(change / (squared + np.float32(length**-2)), s=size))
-    return (0.5 - prior + change[tuple(map(slice, shape))]) * 2 * TRANSITION_CELLS * step
+    flux = [fourier(v, size) for v in splat(points, -area[:, None] * normals, lattice)]
+    # What the first axis has no part in is added up before it is transformed: one transform less.
+    flux[1] *= y
+    flux[1] += flux[2] * z
+    divergence = along_first(flux[0], size) * x + along_first(flux[1], size)
+    change = along_first(fourier(prior, size), size)
+    change *= squared
+    times_gaussian(change, (x, y, z), step)
+    times_gaussian(divergence, (x, y, z), width)
+    change += np.complex64(1j) * divergence
+    change /= squared + np.float32(length**-2)
+    return (0.5 - prior + inverse(change, size, shape)) * 2 * TRANSITION_CELLS * step
 
 
-def fourier(x: Grid, size: list[int]) -> np.ndarray:
-    """Fourier transform of a grid with empty space after it, single precision."""
-    return np.asarray(rfftn(x.astype(np.float32), s=size))
+def fourier(x: Grid, size: Sequence[int]) -> np.ndarray:
+    """Fourier transform along a grid's last two axes, with empty space after it to `size`, single precision.
+
+    The first axis is still to be transformed (`along_first`). Lines and slices of zeros are left out: near a surface,
+    most of a box is empty.
+    """
+    lines = np.any(x != 0, axis=2)
+    found = np.zeros((len(x), size[1], size[2] // 2 + 1), np.complex64)
+    if lines.any():
+        found[:, : x.shape[1]][lines] = np.asarray(rfft(x[lines].astype(np.float32), n=size[2], axis=1))
+        slices = np.flatnonzero(lines.sum(axis=1))
+        found[slices] = np.asarray(fft(found[slices], axis=1, overwrite_x=True))
+    return found
 
 
-def gaussian(wavenumbers: Sequence[np.ndarray], width: float) -> np.ndarray:
-    """Fourier transform of a Gaussian of this width, given the wavenumbers along each axis."""
-    x, y, z = (np.exp(np.float32(-0.5 * width**2) * w**2) for w in wavenumbers)
-    return x * y * z
+def along_first(x: np.ndarray, size: Sequence[int]) -> np.ndarray:
+    """Fourier transform along the first axis, with empty space after it."""
+    return np.asarray(fft(x, n=size[0], axis=0))
+
+
+def inverse(x: np.ndarray, size: Sequence[int], shape: tuple[int, ...]) -> Grid:
+    """The grid of `shape` that a Fourier transform of `size` is of; the empty space after it is not made."""
+    x = np.asarray(ifft(x, axis=0, overwrite_x=True))[: shape[0]]
+    x = np.asarray(ifft(x, axis=1))[:, : shape[1]]
+    return np.asarray(irfft(x, n=size[2], axis=2))[:, :, : shape[2]]
+
+
+def times_gaussian(x: np.ndarray, wavenumbers: Sequence[np.ndarray], width: float) -> None:
+    """Multiplies, in place, by the Fourier transform of a Gaussian, given the wavenumbers along each axis."""
+    a, b, c = (np.exp(np.float32(-0.5 * width**2) * w**2) for w in wavenumbers)
+    x *= a
+    x *= b * c
 
 
 def splat(points: Points, values: Float[np.ndarray, "p c"], lattice: Lattice) -> list[Grid]:
@@ -85,7 +114,9 @@ def splat(points: Points, values: Float[np.ndarray, "p c"], lattice: Lattice) ->
     flat = np.ravel_multi_index(tuple(at[held].T), lattice.shape)
     share = [(weight * v[:, None])[held] for v in values.T]
     count = int(np.prod(lattice.shape))
-    return [np.bincount(flat, s, minlength=count).astype(float).reshape(lattice.shape) for s in share]
+    return [
+        np.bincount(flat, s, minlength=count).astype(float, copy=False).reshape(lattice.shape) for s in share
+    ]
 
 
 def surface_areas(

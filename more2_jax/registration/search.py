@@ -31,7 +31,7 @@ from more2_jax.registration.starting_poses import candidate_poses, masked_mean
 from more2_jax.types import AnyArray, Embedding, LocalBatch, Sight, pytree, quantity
 
 # Calls of one shape, so that scenes share compiled programs, and small, so that few fillers are worked on.
-OBJECTS_A_CALL = 2  # prepared together
+OBJECTS_A_CALL = 1  # prepared in a call, on CPUs one after the other anyway
 PAIRS_A_CALL = 8  # searched together: what fits a small CPU's caches
 # In any orientation every start is aligned for a third of the steps, and the best third of them go on: as right as all
 # of them for two thirds of the work (docs/developing/notebook/speed_scene.md). Upright there are fewer, of which all

@@ -44,7 +44,7 @@ from more2_jax.registration.search import (
 )
 from more2_jax.types import Registration
 
-PAIRS_A_CALL = 2  # refined in a call: a scene's pairs are few, and filling costs as much as pairs do
+PAIRS_A_CALL = 1  # refined in a call, on CPUs one after the other anyway: nothing is worked on to fill a call
 STILL = 1e-2  # a last step below this (radians, and shares of the radius) has settled
 # How much worse "it did not move" may fit and still be chosen; so much worse, another pose still competes.
 STAYED_RATIO, STAYED_OFFSET = 1.1, 0.01

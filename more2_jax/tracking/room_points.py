@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Bool
 from scipy.spatial import KDTree
 
+from more2_jax.geometry.near_points import NearPoints
 from more2_jax.geometry.poses import Points
 from more2_jax.geometry.room_planes import on_planes, room_planes, within
 from more2_jax.types import Instance, Repair, SceneObject
@@ -59,11 +60,12 @@ def without_room(instances: Sequence[Instance], background: Points, fewest: int)
 
     One that would keep fewer than `fewest` points, or lose hardly any or most of them, stays whole.
     """
-    room = np.concatenate([*(i.points for i in instances), background])
+    room = NearPoints(np.concatenate([*(i.points for i in instances), background]))
+    walls = NearPoints(background)
     cleared, dropped = list[Instance](), dict[int, Dropped]()
     for i in instances:
-        among = np.concatenate([i.points, within(KDTree(i.points), background, BESIDE_M)])
-        on, sure = on_planes(i.points, room_planes(i.points, background, room), among)
+        among = np.concatenate([i.points, within(KDTree(i.points), walls, BESIDE_M)])
+        on, sure = on_planes(i.points, room_planes(i.points, walls, room), among)
         if LEAST_DROPPED <= on.mean() <= MOST_DROPPED and (~on).sum() >= fewest:
             dropped[i.id] = Dropped(count=int(on.sum()), points=len(on), sure=float(sure.sum() / on.sum()))
             cleared.append(some_points(i, ~on))

@@ -12,6 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.spatial import KDTree
 
+from more2_jax.geometry.near_points import NearPoints
 from more2_jax.geometry.poses import Points, apply_pose
 from more2_jax.geometry.room_planes import room_planes, within
 from more2_jax.tracking.objects import accumulated, points_of
@@ -42,11 +43,12 @@ def surroundings(clouds: Sequence[Points], background: Points) -> list[Points]:
         return []
     few = [c[:: max(1, -(-len(c) // OTHER_POINTS))] for c in clouds]
     owner = np.repeat(np.arange(len(few)), [len(c) for c in few])
-    others, room = np.concatenate(few), np.concatenate([background, *clouds])
-    return [around(c, background, others[owner != k], room) for k, c in enumerate(clouds)]
+    others, room = np.concatenate(few), NearPoints(np.concatenate([background, *clouds]))
+    walls = NearPoints(background)
+    return [around(c, walls, others[owner != k], room) for k, c in enumerate(clouds)]
 
 
-def around(cloud: Points, background: Points, others: Points, room: Points) -> Points:
+def around(cloud: Points, background: NearPoints, others: Points, room: NearPoints) -> Points:
     """Points near a cloud, of the background without floor and walls, and of others; `room` is all of the scan."""
     radius = np.linalg.norm(cloud - cloud.mean(axis=0), axis=1).max()
     tree, reach = KDTree(cloud), max(REACH * radius, LEAST_REACH_M)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from more2_jax.geometry.free_space import axes_toward
-from more2_jax.geometry.near_points import RADIUS_M, NearPoints
+from more2_jax.geometry.near_points import CELL_M, RADIUS_M, NearPoints
 
 POINTS = np.random.default_rng(0).uniform(-20, 20, (20_000, 3))
 
@@ -37,6 +37,18 @@ def test_what_is_in_view_comes_once_and_most_else_stays(half):
         assert len(found) < len(POINTS) and (half > 1 or len(found) < len(POINTS) / 2)
 
 
+@pytest.mark.parametrize("size", [0.0, 0.7, 5.0, 100.0])
+def test_around_a_box_all_of_it_comes_in_the_order_given_and_little_else(size):
+    near = NearPoints(POINTS)
+    for low in np.random.default_rng(1).uniform(-22, 20, (20, 3)):
+        found = near.around_box(low, low + size)
+        kept = ((found >= low) & (found <= low + size)).all(axis=1)
+        wanted = ((low <= POINTS) & (low + size >= POINTS)).all(axis=1)
+        np.testing.assert_array_equal(found[kept], POINTS[wanted])
+        assert ((found >= low - CELL_M) & (found <= low + size + CELL_M)).all()
+
+
 def test_of_no_points_none_are_near():
     near = NearPoints(np.zeros((0, 3)))
     assert near.points_of(near.cells_around(np.zeros(3), 5.0)).shape == (0, 3)
+    assert near.around_box(np.zeros(3), np.ones(3)).shape == (0, 3)

@@ -112,6 +112,21 @@ def test_nearest_never_chooses_a_masked_row():
     assert (int(index[0]), float(squared[0])) == (2, 16)
 
 
+def test_nearest_skips_what_is_padding_whichever_rows_that_is():
+    """Rows are compared in blocks of 64, of which some are masked in full."""
+    rng = np.random.default_rng(0)
+    a, b = rng.normal(size=(40, 3)), rng.normal(size=(400, 3))
+    mask = np.zeros(400, bool)
+    mask[70:90] = mask[300:330] = True
+    for index in (nearest_index, jax.vmap(nearest_index, in_axes=(0, None, None))):
+        few = f32(a if index is nearest_index else a[None])
+        found = np.asarray(index(few, f32(b), jnp.asarray(mask))).ravel()
+        assert mask[found].all()
+        away = np.linalg.norm(a - b[found], axis=1) ** 2
+        least = (np.linalg.norm(a[:, None] - b[mask], axis=2) ** 2).min(axis=1)
+        np.testing.assert_allclose(away, least, rtol=2**-10)
+
+
 def test_of_rows_as_near_the_first_that_is_real_is_nearest():
     b, mask = np.full((200, 3), 9.0), np.ones(200, bool)
     b[[3, 70, 130, 199]], mask[3] = 1.0, False

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial import KDTree
 
+from more2_jax.geometry.near_points import NearPoints
 from more2_jax.geometry.room_planes import within
 
 
@@ -13,7 +14,8 @@ def test_within_holds_what_distances_say(reach, shift):
     rng = np.random.default_rng(0)
     cloud, points = rng.normal(size=(200, 3)) + shift, rng.uniform(-4, 4, (3000, 3)) + shift
     distance = np.linalg.norm(points[:, None] - cloud, axis=-1).min(axis=1)
-    np.testing.assert_array_equal(within(KDTree(cloud), points, reach), points[distance < reach])
+    for asked in (points, NearPoints(points)):
+        np.testing.assert_array_equal(within(KDTree(cloud), asked, reach), points[distance < reach])
     assert 0 < (distance < reach).sum() < len(points)
 
 

@@ -202,15 +202,12 @@ def test_a_field_asked_less_finely_is_interpolated(field_is, tiny_prior):
     assert solid(some).is_watertight
 
 
-def test_values_do_not_depend_on_how_many_are_asked_at_once(tiny_prior, monkeypatch):
+def test_values_do_not_depend_on_how_many_are_asked_at_once(tiny_prior):
     embedding = embed(tiny_prior, [np.random.default_rng(0).normal(size=(300, 3))])[0]
     queries = np.random.default_rng(1).uniform(-0.5, 0.5, (3000, 3))
     few = meshing._in_chunks(meshing._field_values, tiny_prior, embedding, queries[:100])
     turns = meshing._in_chunks(meshing._field_values, tiny_prior, embedding, queries)
-    monkeypatch.setattr(meshing, "CHUNK", 4096)
-    once = meshing._in_chunks(
-        meshing._field_values, tiny_prior, embedding, queries
-    )  # 4096 rows instead of twice 2048
+    once = meshing._in_chunks(meshing._field_values, tiny_prior, embedding, queries, 4096)
     assert once.shape == turns.shape == (3000,) and np.ptp(once) > 1e-3
     np.testing.assert_allclose(once, turns, atol=1e-6)
     np.testing.assert_allclose(once[:100], few, atol=1e-6)

@@ -5,7 +5,7 @@ import pytest
 from scipy.ndimage import zoom
 from scipy.spatial import cKDTree
 
-from more2_jax.meshing.grid import GridField, cube, surface_cells, upsampled
+from more2_jax.meshing.grid import GridField, crossed_corners, cube, surface_cells, upsampled
 
 
 def test_a_cube_reaches_from_end_to_end_and_keeps_its_corners_when_finer():
@@ -63,3 +63,14 @@ def test_cells_that_the_surface_may_pass_are_looked_into():
 def test_half_the_step_is_linear_interpolation():
     x = np.random.default_rng(0).normal(size=(5, 5, 5))
     np.testing.assert_allclose(upsampled(x), zoom(x, 9 / 5, order=1, grid_mode=False), atol=1e-12)
+
+
+def test_crossed_corners_are_those_of_cells_whose_corners_differ_in_sign():
+    values = np.random.default_rng(0).choice([-1.0, 0.0, 1.0], (6, 5, 4), p=[0.1, 0.05, 0.85])
+    expected = np.zeros(values.shape, bool)
+    for cell in np.ndindex(5, 4, 3):
+        box = tuple(slice(c, c + 2) for c in cell)
+        inside = values[box] < 0
+        expected[box] |= inside.any() and not inside.all()
+    assert 0 < expected.sum() < expected.size
+    np.testing.assert_array_equal(crossed_corners(values), expected)

@@ -13,7 +13,16 @@ from more2_jax.config import MeshingConfig
 from more2_jax.meshing import extract as meshing
 from more2_jax.meshing.extract import HALF_WIDTH, extract_mesh
 from more2_jax.meshing.grid import cube
-from more2_jax.meshing.observed_surface import MAX_POINTS, MIN_POINTS, fit_observed_surface, uniform_subsample
+from more2_jax.meshing.observed_surface import (
+    FACING_POWER,
+    MAX_POINTS,
+    MIN_POINTS,
+    QUERY_PLANES,
+    QUERY_PLANES_NOISELESS,
+    ObservedSurface,
+    fit_observed_surface,
+    uniform_subsample,
+)
 from more2_jax.meshing.planes import fit_planes
 from more2_jax.types import Embedding
 
@@ -173,6 +182,58 @@ def test_every_corner_that_is_drawn_is_near():
     near, corners = lattice.corners_near(surface.points, surface.cutoff), lattice.corners()
     drawn = surface.corrected(corners, np.full(len(corners), 5.0)) != 5.0
     assert drawn.any() and near.ravel()[drawn].all() and near.mean() < 0.5
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.01])
+def test_a_query_is_drawn_to_its_planes_by_definition(noise):
+    """Weights of the planes of the nearest point's neighbors, one query at a time."""
+    rng = np.random.default_rng(1)
+    points = sphere(800, 0.3) + noise * rng.normal(size=(800, 3))
+    s = fit_observed_surface(points, points, REACH)
+    queries, field = rng.uniform(-0.4, 0.4, (2000, 3)), rng.normal(size=2000)
+    expected = field.copy()
+    for n, (distance, k) in enumerate(zip(*s.tree.query(queries), strict=True)):
+        if distance > s.cutoff:
+            continue
+        near = s.neighbors[k, : QUERY_PLANES_NOISELESS if s.noiseless else QUERY_PLANES]
+        facing = np.maximum(s.normal[near] @ s.normal[k], 0) ** FACING_POWER
+        weight = facing * np.exp(-0.5 * ((queries[n] - s.points[near]) ** 2).sum(axis=1) / s.gap**2)
+        plane = weight @ ((queries[n] - s.center[near]) * s.normal[near]).sum(axis=1) / weight.sum()
+        along = max(distance**2 - plane**2, 0)
+        share = np.exp(-((plane / s.bandwidth) ** 4) - (along / s.gap**2) ** 2)
+        expected[n] += share * (plane - field[n])
+    assert (expected != field).sum() > 300
+    np.testing.assert_allclose(s.corrected(queries, field), expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("least", [0.002, 0.01, 0.05])
+def test_farther_off_than_signs_reach_no_sign_changes(least):
+    s = fit_observed_surface(sphere(800, 0.3), sphere(800, 0.3), REACH)
+    queries = np.random.default_rng(0).uniform(-0.5, 0.5, (200_000, 3))
+    away = s.tree.query(queries)[0]
+    for field in (-least, least):
+        changed = s.corrected(queries, np.full(len(queries), field)) * field <= 0
+        assert changed.any() and away[changed].max() < s.sign_reach(least) < s.cutoff
+
+
+@pytest.mark.parametrize("radius", [0.4, 0.75])  # the larger one is cut by the box
+def test_what_only_needs_a_sign_changes_no_mesh(ball_of_036, tiny_prior, radius, monkeypatch):
+    config = dataclasses.replace(CONFIG, resolution=64, field_resolution=16, screening_length=0.1)
+    seen, asked, meshes = in_scan(sphere(6000, radius)), [], []
+    corrected = ObservedSurface.corrected
+
+    def counted(surface, queries, *rest):
+        asked[-1] += len(queries)
+        return corrected(surface, queries, *rest)
+
+    monkeypatch.setattr(ObservedSurface, "corrected", counted)
+    for sure in (meshing.SURE_CELLS, np.inf):
+        monkeypatch.setattr(meshing, "SURE_CELLS", sure)
+        asked.append(0)
+        meshes.append(extract_mesh(tiny_prior, PIECE, config, seen=seen))
+    np.testing.assert_array_equal(meshes[0].vertices, meshes[1].vertices)
+    np.testing.assert_array_equal(meshes[0].faces, meshes[1].faces)
+    assert radius > HALF_WIDTH or asked[0] < 0.9 * asked[1]
 
 
 @pytest.mark.parametrize(("noise", "finer"), [(0.0, True), (0.02, False)])

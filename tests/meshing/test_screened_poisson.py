@@ -6,7 +6,15 @@ from scipy.spatial import KDTree
 from shapes import box_distance
 
 from more2_jax.meshing.grid import GridField, cube
-from more2_jax.meshing.screened_poisson import TRANSITION_CELLS, screened_poisson, splat, surface_areas
+from more2_jax.meshing.screened_poisson import (
+    TRANSITION_CELLS,
+    along_first,
+    fourier,
+    inverse,
+    screened_poisson,
+    splat,
+    surface_areas,
+)
 
 N, HALF, LENGTH = 49, 0.6, 0.1
 LATTICE = cube(N - 1, HALF)
@@ -113,3 +121,12 @@ def test_areas_sum_to_the_surface_and_the_other_face_of_a_board_does_not_count()
     assert surface_areas(points, normals, *KDTree(points).query(points, k=12)).sum() == pytest.approx(
         2 * 0.64, rel=0.2
     )
+
+
+@pytest.mark.parametrize("share", [0.0, 0.02, 1.0])
+def test_transforms_that_leave_out_what_is_empty_are_numpys(share):
+    rng = np.random.default_rng(0)
+    x, size = rng.normal(size=(9, 7, 8)) * (rng.random((9, 7, 1)) < share), [12, 10, 15]
+    found = along_first(fourier(x, size), size)
+    np.testing.assert_allclose(found, np.fft.rfftn(x, size, axes=(0, 1, 2)), atol=1e-4)
+    np.testing.assert_allclose(inverse(found, size, x.shape), x, atol=1e-5)
