@@ -48,7 +48,8 @@ def with_rows_for_normals(bare: Weights, seeing: Weights) -> Weights:
 
     Rows for normals come last in every kernel, and columns keep their lengths, which weight normalization needs.
     """
-    known, wanted = flatten_dict(bare), flatten_dict(seeing)
+    known: dict[tuple[str, ...], Array] = dict(flatten_dict(bare))  # type: ignore[arg-type]
+    wanted: dict[tuple[str, ...], Array] = dict(flatten_dict(seeing))  # type: ignore[arg-type]
     filled = {}
     for name, like in wanted.items():
         own = known.get(name, like)
