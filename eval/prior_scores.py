@@ -97,27 +97,24 @@ def main(
         seed: of viewpoints, noise, orientations and scenes.
     """
     weights, shapes = load_prior(prior), open_shards(shards, split)
-    count = min(len(shapes), most or len(shapes))
-    names = [m["name"] for m in shapes.meta[:count]]
-    symmetry = symmetries(shards, frozenset(names))
-    orders = [symmetry[name] for name in names]
-    results: dict[str, Any] = {"prior": weights.name, "split": split, "shapes": count}
+    orders = symmetries(shards, [m["name"] for m in shapes.meta[:most]])
+    results: dict[str, Any] = {"prior": weights.name, "split": split, "shapes": len(orders)}
     for number in views:
         seeing = partial(see_twice, views=number, points=points, noise=noise)
-        rows, codes = score_shapes(weights, shapes, orders[:count], seeing, normals, debiased, (seed, number))
-        results[f"{number} views"] = summary(rows, debiased) | {
-            "instance recall": matching(codes, scenes, seed)
-        }
+        rows, codes = score_shapes(weights, shapes, orders, seeing, normals, debiased, (seed, number))
+        results[f"{number} views"] = summary(rows, debiased) | matching(codes, scenes, seed)
     out.mkdir(parents=True, exist_ok=True)
     (out / "results.json").write_text(json.dumps(results, indent=1))
     Console().print(table(results))
 
 
-def symmetries(folders: Sequence[Path], names: frozenset[str]) -> dict[str, int]:
+def symmetries(folders: Sequence[Path], names: Sequence[str]) -> list[int]:
     """Order of the symmetry about the vertical of the shapes called `names` (see `yaw_symmetry`)."""
+    wanted = frozenset(names)
     every = (s for folder in folders for shard in shard_folders(folder) for s in read_solids(shard))
-    solids = [s for s in every if s.name in names]
-    return {s.name: yaw_symmetry(s.vertices, s.faces) for s in track(solids, description="symmetries")}
+    solids = {s.name: s for s in every if s.name in wanted}
+    chosen = (solids[name] for name in track(names, description="symmetries"))
+    return [yaw_symmetry(s.vertices, s.faces) for s in chosen]
 
 
 Seeing = Callable[..., dict[str, np.ndarray]]  # of a shape and a generator, as `see_twice`
@@ -264,7 +261,7 @@ def matching(codes: Embedding, scenes: int, seed: int) -> dict[str, Any]:
         right.append(int(np.sum(matched(scene, real, CodeMatcher()))))
         of.append(int(real.sum()))
     share = np.array(right) / np.array(of)
-    return figure(share, np.sum(right) / np.sum(of))
+    return {"instance recall": figure(share, np.sum(right) / np.sum(of))}
 
 
 def summary(rows: Sequence[Row], debiased: bool = False) -> dict[str, Any]:
