@@ -102,10 +102,10 @@ def work(
     batch: int,
 ) -> list[list[Record]]:
     """Records of some scenes, encoded together: one a scan pair and method."""
-    clouds = [i.points for s in scenes for scan in s.scans for i in scan.instances]
+    every = [i for s in scenes for scan in s.scans for i in scan.instances]
     began = time.perf_counter()
-    codes = embed_all(prior, clouds, batch)
-    encoding_s = (time.perf_counter() - began) / max(1, len(clouds))
+    codes = embed_all(prior, [i.points for i in every], batch, [i.normals for i in every])
+    encoding_s = (time.perf_counter() - began) / max(1, len(every))
     found, used = [], 0
     for scene in scenes:
         counts = [len(scan.instances) for scan in scene.scans]

@@ -28,7 +28,7 @@ from eval.peers.reconstruction import SURFACERS, Surfacer
 from eval.scores.figures import Column, Figure, Record
 from eval.scores.mesh_scores import RECONSTRUCTED, mesh_scores
 from more2_jax.config import SceneConfig, preset
-from more2_jax.geometry.poses import apply_pose
+from more2_jax.geometry.poses import apply_pose, turned
 from more2_jax.meshing.object_mesh import object_mesh
 from more2_jax.network.prior import Prior
 from more2_jax.refinement.joint_of_objects import fit_objects
@@ -111,6 +111,7 @@ class Seen:
     scene: KnownScene
     known: KnownObject
     points: Float[np.ndarray, "n 3"]
+    normals: Float[np.ndarray, "n 3"] | None  # zeros where not known; None: nowhere
     point_scan: Int[np.ndarray, " n"]
     observations: tuple[Observation, ...]
 
@@ -125,13 +126,18 @@ def accumulated(scene: KnownScene, o: KnownObject, scans: int) -> Seen:
     """What the first `scans` scans saw of an object."""
     there = [k for k, i in o.instance.items() if k < scans and i != LOST]
     poses = [o.true_pose(o, k, 0) for k in there]
-    clouds = [
-        apply_pose(T, scene.instance(k, o.instance[k]).points) for k, T in zip(there, poses, strict=True)
-    ]
+    seen = [scene.instance(k, o.instance[k]) for k in there]
+    clouds = [apply_pose(T, i.points) for i, T in zip(seen, poses, strict=True)]
+    normals = [turned(T, i.normals) for i, T in zip(seen, poses, strict=True)]
     return Seen(
         scene=scene,
         known=o,
         points=np.concatenate(clouds),
+        normals=None
+        if all(n is None for n in normals)
+        else np.concatenate(
+            [np.zeros_like(c) if n is None else n for c, n in zip(clouds, normals, strict=True)]
+        ),
         point_scan=np.concatenate([np.full(len(c), k) for k, c in zip(there, clouds, strict=True)]),
         observations=tuple(
             Observation(scan=k, instance=o.instance[k], T_ref_scan=T, score=1.0, rms_m=0.0, converged=True)
@@ -173,13 +179,14 @@ def timed(stage: Callable[[], list[AccumulatedObject]], count: int) -> tuple[lis
 
 def embedded(prior: Prior, seen: Sequence[Seen], batch: int) -> list[AccumulatedObject]:
     """The objects in the rooms that their scans show, as refinement and meshing take them."""
-    codes = embed_all(prior, [s.points for s in seen], batch)
+    codes = embed_all(prior, [s.points for s in seen], batch, [s.normals for s in seen])
     return [
         AccumulatedObject(
             points=s.points,
             observation=np.searchsorted([seen.scan for seen in s.observations], s.point_scan),
             poses=np.stack([seen.T_ref_scan for seen in s.observations]),
             embedding=code,
+            normals=s.normals,
             sensors=tuple(few_sensors(s.scene.scans[seen.scan]) for seen in s.observations),
             background=remembered(s.scene.scans[0].background),
         )

@@ -232,9 +232,10 @@ def ready_pairs(
     pairs: Sequence[TruePair], prior: Prior, batch: int
 ) -> tuple[list[PairToRegister], float, float]:
     """The pairs with their codes and sights, and the seconds that each of the two took a pair."""
-    clouds = [p.clouds for p in pairs]
+    clouds = [c for p in pairs for c in p.clouds]
+    normals = [i.normals for p in pairs for i in p.instances]
     began = time.perf_counter()
-    codes = embed_all(prior, [c for pair in clouds for c in pair], batch)
+    codes = embed_all(prior, clouds, batch, normals)
     encoding_s = (time.perf_counter() - began) / len(pairs)
     began = time.perf_counter()
     sights = [p.sights() for p in pairs]

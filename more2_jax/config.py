@@ -55,6 +55,7 @@ class PriorConfig:
     decoder: DecoderConfig = field(default_factory=DecoderConfig)
     eqv_gain: float = 1.0
     inv_gain: float = 1.0
+    bare_decoder: bool = False  # a second decoder for objects of which no normal is known
 
 
 @dataclass(frozen=True)

@@ -40,19 +40,24 @@ def over_devices(tree: Tree, batch: int) -> Tree:
     return jax.device_put(tree, NamedSharding(mesh, PartitionSpec("batch")))
 
 
-def padded_batch(clouds: Sequence[Points], batch: int) -> PointCloud:
+def padded_batch(
+    clouds: Sequence[Points], batch: int, normals: Sequence[Points | None] | None = None
+) -> PointCloud:
     """Clouds as one batch of the fixed shape (batch, `MAX_POINTS`, 3), spread over devices."""
-    cloud = pad_batch(pad_clouds(clouds, MAX_POINTS), batch)
-    points, mask = over_devices((cloud.points, cloud.mask), batch)
-    return dataclasses.replace(cloud, points=points, mask=mask)
+    cloud = pad_batch(pad_clouds(clouds, MAX_POINTS, normals), batch)
+    points, mask, known = over_devices((cloud.points, cloud.mask, cloud.normals), batch)
+    return dataclasses.replace(cloud, points=points, mask=mask, normals=known)
 
 
-def embed_all(prior: Prior, clouds: Sequence[Points], batch: int) -> list[Embedding]:
-    """One embedding a cloud, host arrays, in calls of `batch` clouds."""
+def embed_all(
+    prior: Prior, clouds: Sequence[Points], batch: int, normals: Sequence[Points | None] | None = None
+) -> list[Embedding]:
+    """One embedding a cloud, host arrays, in calls of `batch` clouds; `normals` as `pad_clouds` takes them."""
     found: list[Embedding] = []
     for start in range(0, len(clouds), batch):
         part = clouds[start : start + batch]
-        found += unstack(encode(prior, padded_batch(part, batch)), len(part))
+        known = None if normals is None else normals[start : start + batch]
+        found += unstack(encode(prior, padded_batch(part, batch, known)), len(part))
     return found
 
 

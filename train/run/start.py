@@ -11,6 +11,7 @@ import numpy as np
 
 from more2_jax.config import PriorConfig
 from more2_jax.network.prior import Prior, encode_ordered, init_prior, load_prior
+from more2_jax.network.two_decoders import with_rows_for_normals, without_normals
 from train.run.settings import TrainingConfig, TrainingRun
 from train.run.shape_mix import ShapeMix
 from train.shards.sampling import sample_batch
@@ -29,7 +30,7 @@ def started_warm(model: PriorConfig, weights: str, name: str) -> Prior:
 
     Raises ValueError if they are not of this model.
     """
-    prior = load_prior(weights)
+    prior = one_decoder(load_prior(weights), model.decoder.normals)
     if model.decoder.normals and not prior.config.decoder.normals:
         prior = seeing_normals(prior)
     scale = prior.config.encoder.output_scale  # measured at the start of their training, and theirs for good
@@ -51,13 +52,22 @@ def seeing_normals(prior: Prior) -> Prior:
     decoder = dataclasses.replace(prior.config.decoder, normals=True)
     config = dataclasses.replace(prior.config, decoder=decoder)
     fresh = init_prior(config, jax.random.key(0)).params["decoder"]
-    known = prior.params["decoder"]
-    params = {name: part | known[name] for name, part in fresh.items()}
-    for name in ("layer_0", f"layer_{decoder.skip_layer}"):
-        old = known[name]["direction"]
-        more = len(fresh[name]["direction"]) - len(old)
-        params[name] |= {"direction": jnp.pad(old, ((0, more), (0, 0)))}  # columns keep their lengths
+    params = with_rows_for_normals(prior.params["decoder"], fresh)
     return dataclasses.replace(prior, params=prior.params | {"decoder": params}, config=config)
+
+
+def one_decoder(prior: Prior, normals: bool) -> Prior:
+    """Of a prior with two decoders the one that reads normals, or the one that reads none; any other prior as it is."""
+    if not prior.config.bare_decoder:
+        return prior
+    params = {
+        "encoder": prior.params["encoder"],
+        "decoder": prior.params["decoder" if normals else "bare_decoder"],
+    }
+    seeing = dataclasses.replace(prior.config, bare_decoder=False)
+    return dataclasses.replace(
+        prior, params=params, config=seeing if normals else without_normals(prior.config)
+    )
 
 
 def calibrated(model: PriorConfig, training: TrainingConfig, train: ShapeMix) -> PriorConfig:

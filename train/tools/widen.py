@@ -24,6 +24,7 @@ from more2_jax.config import DecoderConfig, PriorConfig, load_config
 from more2_jax.network.prior import Prior, init_prior, load_prior, save_prior
 from train.run.program import run
 from train.run.settings import TrainingRun
+from train.run.start import one_decoder
 
 Weights = dict[str, np.ndarray]
 Parts = Sequence[tuple[int, int]]  # widths, before and after, of what stands side by side in a matrix' rows
@@ -87,6 +88,7 @@ def widen(prior: Prior, config: PriorConfig, key: Array) -> Prior:
     To rounding, and where `points`, `neighbors` and `downsample_factors` are equal. Raises ValueError, naming the
     setting, where `config` is narrower or of another structure.
     """
+    prior = one_decoder(prior, config.decoder.normals)
     check(prior.config, config)
     # F_s is a mean over the channels of the code, new ones included.
     more = config.encoder.code / prior.config.encoder.code
