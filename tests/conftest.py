@@ -11,10 +11,11 @@ import jax
 import jaxtyping
 import pytest
 from checked_modules import checked_modules
-from compiling import quickly
+from compiling import compile_quickly, optimized
 from jaxtyping import install_import_hook
 from places import ROOT
 
+compile_quickly()
 # Before anything of more2_jax is imported: every call's shapes and dtypes are held against its annotations.
 install_import_hook(checked_modules(), "beartype.beartype")
 jax.config.update("jax_default_matmul_precision", "highest")
@@ -38,8 +39,8 @@ def tiny_prior():
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_protocol(item):
-    """Tests marked `quickly` compile so, their fixtures included."""
-    with quickly() if item.get_closest_marker("quickly") else nullcontext():
+    """Tests marked `optimized` compile so, their fixtures included."""
+    with optimized() if item.get_closest_marker("optimized") else nullcontext():
         return (yield)
 
 

@@ -11,7 +11,6 @@ import jax.numpy as jnp
 import jaxlie
 import numpy as np
 import pytest
-from compiling import quick_jit
 
 import more2_jax as m2
 from more2_jax.config import (
@@ -61,7 +60,7 @@ def number(tree) -> jax.Array:
 
 @pytest.fixture(scope="module")
 def code(tiny_prior):
-    return quick_jit(m2.encode)(tiny_prior, cloud_of(jnp.asarray(points())))
+    return jax.jit(m2.encode)(tiny_prior, cloud_of(jnp.asarray(points())))
 
 
 def pairs_of(x, code):
@@ -122,18 +121,17 @@ def test_public_functions_trace(tiny_prior, code, name, transformation):
     assert jax.tree.leaves(jax.eval_shape(f, jnp.asarray(points())))
 
 
-@pytest.mark.quickly
 def test_jitted_registration_takes_its_settings_as_they_are(tiny_prior, code):
     pairs = pairs_of(jnp.asarray(points()), code)
     plain = m2.register(tiny_prior, pairs, DESCENT)
     for jitted in (
-        quick_jit(m2.register)(tiny_prior, pairs, DESCENT),
-        quick_jit(m2.register, static_argnames="motion")(tiny_prior, pairs, DESCENT, motion="upright"),
+        jax.jit(m2.register)(tiny_prior, pairs, DESCENT),
+        jax.jit(m2.register, static_argnames="motion")(tiny_prior, pairs, DESCENT, motion="upright"),
     ):
         np.testing.assert_allclose(jitted.loss, plain.loss, rtol=1e-4)
     observations = observations_of(jnp.asarray(points()), code)
     joint = m2.fit_jointly(tiny_prior, observations, JOINT)
-    again = quick_jit(m2.fit_jointly)(tiny_prior, observations, JOINT)
+    again = jax.jit(m2.fit_jointly)(tiny_prior, observations, JOINT)
     np.testing.assert_allclose(again.loss, joint.loss, rtol=1e-4)
 
 

@@ -85,7 +85,6 @@ def test_true_poses_lay_scans_onto_the_surfaces(rooms):
 PROGRAMS = {matching: "robust", registration: "field", reconstruction: "robust", end_to_end: "robust"}
 
 
-@pytest.mark.quickly
 @pytest.mark.parametrize("program", PROGRAMS, ids=lambda p: p.__name__)
 def test_every_program_scores_it(rooms, tmp_path, tiny_prior, program):
     save_prior(tiny_prior, tmp_path / "tiny.npz")
