@@ -1,5 +1,6 @@
 """Which starts of a search go on after its first steps."""
 
+import jax
 import jax.numpy as jnp
 import jaxlie
 import numpy as np

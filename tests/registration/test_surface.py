@@ -1,5 +1,6 @@
 """The prior is asked only where it can decide: what is chosen, and what competes, are as if it were always asked."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
