@@ -16,6 +16,8 @@ from more2_jax.cli.main import main
 from more2_jax.network.prior import load_prior, save_prior
 from more2_jax.storage.scene_folder import load_scene
 
+pytestmark = pytest.mark.optimized  # scenes run for longer than their programs compile
+
 POSIX = pytest.mark.skipif(os.name != "posix", reason="sends signals")
 # Stops at a named place, says so, and waits there to be sent a signal.
 STOPPING = """

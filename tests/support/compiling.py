@@ -4,40 +4,30 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.metadata import version
-from typing import Any
-from unittest.mock import patch
 
-from jax._src import compiler  # which options programs compile with has no public door
+import jax
 
-EMITTERS, LEVEL = "xla_cpu_use_fusion_emitters", "xla_backend_optimization_level"
-KNOWS_EMITTERS = version("jaxlib").startswith(
-    ("0.9.", "0.10.")
-)  # XLA ends the process at a flag it does not know
-# As XLA compiles where nobody asks for anything else.
-OPTIMIZED = {LEVEL: 3} | ({EMITTERS: True} if KNOWS_EMITTERS else {})
+LITTLE = "jax_disable_most_optimizations"  # an option of JAX
 
 
 def compile_quickly() -> None:
-    """Has this process, and those that it starts, compile with little optimization; before JAX compiles anything.
+    """Has this process compile with little optimization; before JAX compiles anything.
 
-    Such programs compile several times faster, run slower, and compute the same up to rounding.
+    Such programs compile several times faster, run slower, and compute the same up to rounding. Processes that tests
+    start compile as they do for users.
     """
-    flags = [f"--{LEVEL}=0", *([f"--{EMITTERS}=false"] if KNOWS_EMITTERS else [])]
-    os.environ["XLA_FLAGS"] = " ".join(flags)
-
-
-def as_users_compile() -> dict[str, str]:
-    """The environment for a process that compiles as if no test had started it."""
-    return {name: value for name, value in os.environ.items() if name != "XLA_FLAGS"}
+    # XLA ends the process at flags that it does not know. The commands set this one, too: what they compile is found
+    # again by the tests that are marked, and the other way round.
+    if version("jaxlib").startswith(("0.9.", "0.10.")):
+        os.environ["XLA_FLAGS"] = "--xla_cpu_use_fusion_emitters=false"
+    jax.config.update(LITTLE, True)
 
 
 @contextmanager
 def optimized() -> Iterator[None]:
-    """Programs compile with the optimization of users meanwhile; those compiled before stay as they are."""
-    real = compiler.get_compile_options
-
-    def options(*args: Any, env_options_overrides: dict[str, Any] | None = None, **rest: Any) -> Any:
-        return real(*args, env_options_overrides=OPTIMIZED | (env_options_overrides or {}), **rest)
-
-    with patch.object(compiler, "get_compile_options", options):
+    """Programs compile as the commands compile them meanwhile; those compiled before stay as they are."""
+    jax.config.update(LITTLE, False)
+    try:
         yield
+    finally:
+        jax.config.update(LITTLE, True)
