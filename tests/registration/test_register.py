@@ -26,6 +26,8 @@ from more2_jax.registration.register_pairs import register
 from more2_jax.registration.search import scaled_pose
 from more2_jax.types import ObservedObject
 
+pytestmark = pytest.mark.no_cover
+
 POINTS = 512  # of every cloud registered by surfaces here: compiled once a prior
 # Fewer points than the preset: the clouds are clean, and what is tested is the same.
 SURFACE = SurfaceRegistration(search=SurfaceSearch(points=64, dense=256, cells=16, keep=4))
@@ -139,6 +141,7 @@ def test_a_symmetric_object_that_stayed_is_said_to_have_stayed(tiny_prior):
     np.testing.assert_allclose(found[0], np.eye(4), atol=1e-6)
 
 
+@pytest.mark.optimized  # a line turned round differs from itself by rounding
 def test_flat_straight_and_single_points_give_finite_poses(tiny_prior):
     cloud = furniture()[0]
     degenerate = [cloud * [1, 1, 0], cloud * [1, 0, 0], cloud[:1], np.repeat(cloud[:2], 10, axis=0)]

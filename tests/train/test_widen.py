@@ -18,6 +18,8 @@ from train.run.settings import TrainingRun
 from train.tools import widen as program
 from train.tools.widen import source_layer, widen
 
+pytestmark = pytest.mark.no_cover
+
 NARROW = PriorConfig(
     encoder=EncoderConfig(
         widths=(8, 8, 16), code=12, neighbors=4, head_channels=8, points=32, output_scale=100.0,
