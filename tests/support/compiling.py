@@ -24,10 +24,11 @@ def compile_quickly() -> None:
 
 
 @contextmanager
-def optimized() -> Iterator[None]:
-    """Programs compile as the commands compile them meanwhile; those compiled before stay as they are."""
-    jax.config.update(LITTLE, False)
+def optimized(much: bool = True) -> Iterator[None]:
+    """Programs compile as the commands compile them meanwhile, or not; those compiled before stay as they are."""
+    before = jax.config.values[LITTLE]
+    jax.config.update(LITTLE, not much)
     try:
         yield
     finally:
-        jax.config.update(LITTLE, True)
+        jax.config.update(LITTLE, before)
