@@ -22,6 +22,8 @@ from train.rooms.real_visits import RealConfig, real_scene
 from train.rooms.scene_files import read_scene
 from train.tools import as_threerscan
 
+pytestmark = pytest.mark.no_cover
+
 QUICK = ScanSettings(
     sensor=DepthSensor(width=80, height=60),
     walk=Walk(views_of_an_object=2, views_of_walls=5, frames_a_view=3),
