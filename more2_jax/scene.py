@@ -23,11 +23,13 @@ from more2_jax.refinement.joint_of_objects import fit_objects
 from more2_jax.refinement.pose_graph_of_objects import refine_object_poses
 from more2_jax.tracking.accumulated import accumulated_objects, embed_accumulated, with_refined
 from more2_jax.tracking.changes import changes_between, forgotten, not_seen_in
+from more2_jax.tracking.comparison import Comparison
 from more2_jax.tracking.identify import Found, Identified, identify
+from more2_jax.tracking.joined_masks import join_parts
 from more2_jax.tracking.leveling import as_given, level_of, leveled, shows_floor
 from more2_jax.tracking.looked_at import not_looked_at
 from more2_jax.tracking.mask_borders import mend_borders
-from more2_jax.tracking.merged_masks import Divided, divide_merged
+from more2_jax.tracking.merged_masks import divide_merged
 from more2_jax.tracking.object_views import few_sensors, instance_sights, object_sights
 from more2_jax.tracking.objects import (
     SCENE_FRAME,
@@ -36,6 +38,7 @@ from more2_jax.tracking.objects import (
     next_number,
     seen_again,
 )
+from more2_jax.tracking.regrouped import Regrouped
 from more2_jax.tracking.relocalize import known_object, relocalize
 from more2_jax.tracking.room_points import Cleared, without_room
 from more2_jax.tracking.scan_frame import Rooms
@@ -53,6 +56,9 @@ from more2_jax.types import (
     SceneObject,
     Skipped,
 )
+
+# Masks, objects and instances as they were compared, who is who.
+Compared = tuple[Regrouped, list[tuple[ObservedObject, Pose]], list[ObservedObject], Identified]
 
 CLOSED_AT_ONCE = 64  # objects whose poses are refined at a time: what they take beside the scene, a MB each
 BACKGROUND_POINTS = 20_000  # of a scan, remembered for the page and for what its sensors looked through
@@ -92,24 +98,27 @@ def who_is_who(
     scan: Scan,
     config: SceneConfig,
     stage: Callable[[str, int], AbstractContextManager[Any]],
-) -> tuple[Divided, list[tuple[ObservedObject, Pose]], list[ObservedObject], Identified]:
-    """The objects and a scan's instances, masks that hold two objects divided; both as compared; which are one."""
+) -> Compared:
+    """The objects and a scan's instances, parts joined, masks of two divided; both as compared; who is who."""
     with stage("encode", len(instances)):
         embeddings = embed(prior, [i.points for i in instances], [i.normals for i in instances])
-    whole = Divided(objects=list(scene.objects), instances=list(instances), embeddings=embeddings)
-    rooms = rooms_of(scene, scan)
+    masks = Regrouped(objects=list(scene.objects), instances=list(instances), embeddings=embeddings)
+    rooms, first = rooms_of(scene, scan), next_number(scene.objects, scene.scans)
+
+    def compare(masks: Regrouped) -> Compared:
+        known = dataclasses.replace(scene, objects=tuple(masks.objects))
+        old, new = compared_objects(known, masks.instances, masks.embeddings, scan, config)
+        return masks, old, new, identify(prior, [o for o, _ in old], new, config, rooms)
+
+    regroup = join_parts, partial(divide_merged, first_number=first)
     with stage("match", len(instances)):
-        old, new = compared_objects(scene, instances, embeddings, scan, config)
-        identified = identify(prior, [o for o, _ in old], new, config, rooms)
-        divided = None
-        if config.repair_masks:
-            first = next_number(scene.objects, scene.scans)
-            divided = divide_merged(prior, whole, [o for o, _ in old], new, identified, config, first)
-        if divided is None:
-            return whole, old, new, identified
-        scene = dataclasses.replace(scene, objects=tuple(divided.objects))
-        old, new = compared_objects(scene, divided.instances, divided.embeddings, scan, config)
-        return divided, old, new, identify(prior, [o for o, _ in old], new, config, rooms)
+        known = compare(masks)
+        for mend in regroup if config.repair_masks else ():
+            masks, old, new, identified = known
+            compared = Comparison.of(prior, [o for o, _ in old], new, identified, config)
+            mended = compared and mend(masks, compared)
+            known = compare(mended) if mended else known
+        return known
 
 
 def add_scan(
@@ -146,9 +155,9 @@ def add_scan(
     fresh = new_objects(first, index, left, whole.instances, [o.embedding for o in new], frame)
     chance = chances(identified, objects, fresh, config)
     objects, frame = as_given([*mended.whole(objects), *fresh.values()], index, frame, T_level_scan)
-    scene = forgotten(scene, mended.absorbed)
     repairs = (*whole.repairs, *whole.masks(found, fresh), *mended.repairs)
-    repairs = (*repairs, *cleared.repairs(index, objects, mended.repairs), *borders)
+    scene = forgotten(scene, {id_ for r in repairs for id_ in r.absorbed})
+    repairs = (*repairs, *cleared.repairs(index, objects, repairs), *borders)
     scans = (*scene.scans, record(index, scan, masks, skipped, frame, unseen, repairs))
     changes = (*scene.changes, changes_between(objects, index - 1, index, config, chance, not_seen_in(scans)))
     return dataclasses.replace(scene, scans=scans, objects=tuple(objects), changes=changes, timing_s=timing)

@@ -97,9 +97,14 @@ def probability(
     odds: Float[np.ndarray, "*pairs"], search: SurfaceSearch, motion: MotionModel
 ) -> Float[np.ndarray, "*pairs"]:
     """Of pairs to be one object, by their log odds as `calibrated` has them."""
+    return expit(odds - even_odds(search, motion))
+
+
+def even_odds(search: SurfaceSearch, motion: MotionModel) -> float:
+    """What `calibrated` has of a pair that is one object or is not with an even chance."""
     if motion == "upright":
-        return expit(odds - UPRIGHT.raised)
-    return expit(odds - (FREE if asks_prior(search, motion) else UNASKED).raised)
+        return UPRIGHT.raised
+    return (FREE if asks_prior(search, motion) else UNASKED).raised
 
 
 def log_odds(evidence: PairEvidence, compared: Compared, c: Calibration) -> Float[np.ndarray, "*pairs"]:

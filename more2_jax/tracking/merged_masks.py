@@ -7,28 +7,24 @@ be, proposes how a mask may fall in two; surfaces decide, as they decide who is 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
-from functools import cached_property
+from collections.abc import Mapping, Sequence
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from scipy.spatial import KDTree
 
-from more2_jax.config import EvidenceMatcher, SceneConfig
 from more2_jax.geometry.normalized_cut import Cut, Rows, thinnest_cuts
-from more2_jax.geometry.poses import Points, Pose, apply_pose
+from more2_jax.geometry.poses import Points, apply_pose
 from more2_jax.geometry.transform import transform
-from more2_jax.matching.candidates import AlignedPairs, align_candidates, evidence_at, odds_of
 from more2_jax.matching.color import color_of
 from more2_jax.network.embedding_batch import embed
-from more2_jax.network.prior import Prior
+from more2_jax.tracking.comparison import Comparison
 from more2_jax.tracking.divisions import Division, Part, Wholes, chosen
-from more2_jax.tracking.identify import Found, Identified
 from more2_jax.tracking.objects import place_of
+from more2_jax.tracking.regrouped import Regrouped
 from more2_jax.tracking.room_points import some_points
 from more2_jax.tracking.split_masks import reach_m
-from more2_jax.types import Embedding, Instance, ObservedObject, Repair, SceneObject
+from more2_jax.types import Instance, ObservedObject, Repair, SceneObject
 
 Normals = Float[np.ndarray, "n 3"]
 
@@ -36,62 +32,21 @@ Normals = Float[np.ndarray, "n 3"]
 LEAST_PART = 0.1  # share of a mask's points that either half must have
 CUTS = 2  # of a graph, that are tried
 NEIGHBORS = 7  # of a point, itself among them, that say whether it lies beside a thing
-CANDIDATES = 3  # partners of every half that are aligned
 
 
-@dataclass(frozen=True, kw_only=True)
-class Divided:
-    """Objects and instances; of those divided the larger half in the place of the whole, the smaller at the end."""
-
-    objects: list[SceneObject]
-    instances: list[Instance]
-    embeddings: list[Embedding]  # of the instances
-    halves: tuple[tuple[int, int], ...] = ()  # rows of instances that are one mask
-    repairs: tuple[Repair, ...] = ()  # of objects
-
-    def masks(self, found: Sequence[Found], fresh: Mapping[int, SceneObject]) -> tuple[Repair, ...]:
-        """The masks of this scan that were divided. `fresh`: new objects by the rows of their instances."""
-        names = {f.instance: self.objects[f.object].id for f in found} | {i: o.id for i, o in fresh.items()}
-        return tuple(
-            Repair(object=names[i], instances=(self.instances[i].id,), divided=names[j])
-            for i, j in self.halves
-            if i in names and j in names
-        )
-
-
-def divide_merged(
-    prior: Prior,
-    whole: Divided,
-    old: Sequence[ObservedObject],
-    new: Sequence[ObservedObject],
-    identified: Identified,
-    config: SceneConfig,
-    first_number: int,
-) -> Divided | None:
+def divide_merged(whole: Regrouped, compared: Comparison, first_number: int) -> Regrouped | None:
     """Divides instances that hold two objects known apart, and objects, seen once, that two instances show apart.
 
-    `old` and `new`: objects and instances as they were compared. None if there is nothing to divide, or nothing
-    is known of surfaces (`CodeMatcher`).
+    None if there is nothing to divide.
     """
-    if not isinstance(config.matching, EvidenceMatcher) or identified.aligned is None:
-        return None
-    compared = Compared(
-        prior=prior,
-        old=old,
-        new=new,
-        identified=identified,
-        aligned=identified.aligned,
-        matcher=config.matching,
-        config=config,
-    )
-    of_instances = compared.divisions_of_instances(whole.instances)
-    of_objects = compared.divisions_of_objects(whole.objects)
+    of_instances = divisions_of_instances(compared, whole.instances)
+    of_objects = divisions_of_objects(compared, whole.objects)
     if not of_instances and not of_objects:
         return None
     return with_instances_divided(with_objects_divided(whole, of_objects, first_number), of_instances)
 
 
-def with_objects_divided(whole: Divided, divisions: Sequence[Division], first_number: int) -> Divided:
+def with_objects_divided(whole: Regrouped, divisions: Sequence[Division], first_number: int) -> Regrouped:
     """The smaller halves get the ids from `first_number` on."""
     objects, repairs = list(whole.objects), list(whole.repairs)
     for n, d in enumerate(divisions):
@@ -104,7 +59,7 @@ def with_objects_divided(whole: Divided, divisions: Sequence[Division], first_nu
     return dataclasses.replace(whole, objects=objects, repairs=tuple(repairs))
 
 
-def with_instances_divided(whole: Divided, divisions: Sequence[Division]) -> Divided:
+def with_instances_divided(whole: Regrouped, divisions: Sequence[Division]) -> Regrouped:
     """Both halves keep the id that the scan's mask has."""
     instances, embeddings, halves = list(whole.instances), list(whole.embeddings), list(whole.halves)
     for d in divisions:
@@ -117,146 +72,105 @@ def with_instances_divided(whole: Divided, divisions: Sequence[Division]) -> Div
     return dataclasses.replace(whole, instances=instances, embeddings=embeddings, halves=tuple(halves))
 
 
-@dataclass(frozen=True, kw_only=True)
-class Compared:
-    """Two scans as they were compared: what a half of one may be in the other."""
+def divisions_of_instances(compared: Comparison, instances: Sequence[Instance]) -> list[Division]:
+    """Which instances hold two objects that are known apart."""
+    partner = {f.instance: f.object for f in compared.identified.found}
+    wholes = wholes_of(partner, compared.old, compared.odds_of_found(1))
+    cuts = {
+        i: cuts_of(
+            compared,
+            compared.new[i].points,
+            apply_pose(np.linalg.inv(compared.best_pose(partner[i], i)), compared.old[partner[i]].points)
+            if i in partner
+            else None,
+        )
+        for i in range(len(instances))
+        if wholes.in_doubt(i)
+    }
 
-    prior: Prior
-    old: Sequence[ObservedObject]
-    new: Sequence[ObservedObject]
-    identified: Identified
-    aligned: AlignedPairs
-    matcher: EvidenceMatcher
-    config: SceneConfig
-
-    def divisions_of_instances(self, instances: Sequence[Instance]) -> list[Division]:
-        """Which instances hold two objects that are known apart."""
-        partner = {f.instance: f.object for f in self.identified.found}
-        wholes = wholes_of(partner, self.old, self.odds_of_found(1))
-        cuts = {
-            i: self.cuts(
-                self.new[i].points,
-                apply_pose(np.linalg.inv(self.best_pose(partner[i], i)), self.old[partner[i]].points)
-                if i in partner
-                else None,
-            )
-            for i in range(len(instances))
-            if wholes.in_doubt(i)
-        }
-
-        def half(p: Part) -> ObservedObject:
-            i = part_of_instance(instances[p.whole], p)
-            return ObservedObject(
-                points=i.points,
-                embedding=p.embedding,
-                color=color_of(i.colors),
-                sight=self.new[p.whole].sight,
-                normals=i.normals,
-            )
-
-        return chosen(
-            self.halves(cuts, [(i.points, i.normals) for i in instances]),
-            wholes,
-            lambda parts, others: self.odds_of_halves([self.old[k] for k in others], map(half, parts)),
+    def half(p: Part) -> ObservedObject:
+        i = part_of_instance(instances[p.whole], p)
+        return ObservedObject(
+            points=i.points,
+            embedding=p.embedding,
+            color=color_of(i.colors),
+            sight=compared.new[p.whole].sight,
+            normals=i.normals,
         )
 
-    def divisions_of_objects(self, objects: Sequence[SceneObject]) -> list[Division]:
-        """Which objects, seen once, are two that the new scan shows apart."""
-        partner = {f.object: f.instance for f in self.identified.found}
-        wholes = wholes_of(partner, self.new, self.odds_of_found(0))
-        cuts = {
-            k: self.cuts(
-                self.old[k].points,
-                apply_pose(self.best_pose(k, partner[k]), self.new[partner[k]].points)
-                if k in partner
-                else None,
-            )
-            for k, o in enumerate(objects)
-            if len(o.observations) == 1 and wholes.in_doubt(k)
-        }
+    return chosen(
+        halves_of(compared, cuts, [(i.points, i.normals) for i in instances]),
+        wholes,
+        lambda parts, others: compared.odds_of_others([compared.old[k] for k in others], map(half, parts)),
+    )
 
-        def half(p: Part) -> ObservedObject:
-            o = objects[p.whole]
-            normals = None if o.normals is None else o.normals[p.rows]
-            part = ObservedObject(points=o.points[p.rows], embedding=p.embedding, normals=normals)
-            placed = transform(part, place_of(o.observations[-1]))
-            return dataclasses.replace(placed, sight=self.old[p.whole].sight)
 
-        return chosen(
-            self.halves(cuts, [(o.points, o.normals) for o in objects]),
-            wholes,
-            lambda parts, others: {
-                (i, part): z
-                for (part, i), z in self.odds_of_halves(
-                    map(half, parts), [self.new[i] for i in others]
-                ).items()
-            },
+def divisions_of_objects(compared: Comparison, objects: Sequence[SceneObject]) -> list[Division]:
+    """Which objects, seen once, are two that the new scan shows apart."""
+    partner = {f.object: f.instance for f in compared.identified.found}
+    wholes = wholes_of(partner, compared.new, compared.odds_of_found(0))
+    cuts = {
+        k: cuts_of(
+            compared,
+            compared.old[k].points,
+            apply_pose(compared.best_pose(k, partner[k]), compared.new[partner[k]].points)
+            if k in partner
+            else None,
         )
+        for k, o in enumerate(objects)
+        if len(o.observations) == 1 and wholes.in_doubt(k)
+    }
 
-    def cuts(self, points: Points, partner: Points | None) -> list[Cut]:
-        """How a cloud may fall in two: beside what it was found to be, and where it is thinnest."""
-        first: list[Cut] = []
-        if partner is not None:
-            rest = beside_of(partner, points)
-            if rest.mean() < LEAST_PART:
-                return []
-            first = [(rest, False)]
-        thin = thinnest_cuts(points, CUTS, LEAST_PART)
-        first = first or thin[:1]
-        cuts = [*first, *(c for c in thin if c[1] and c is not first[0])]
-        fewest = max(self.config.min_points, LEAST_PART * len(points))
-        return [c for c in cuts if min(c[0].sum(), (~c[0]).sum()) >= fewest]
+    def half(p: Part) -> ObservedObject:
+        o = objects[p.whole]
+        normals = None if o.normals is None else o.normals[p.rows]
+        part = ObservedObject(points=o.points[p.rows], embedding=p.embedding, normals=normals)
+        placed = transform(part, place_of(o.observations[-1]))
+        return dataclasses.replace(placed, sight=compared.old[p.whole].sight)
 
-    def best_pose(self, k: int, i: int) -> Pose:
-        """The pose of a pair that fits best: T_scene_scan as if the object had not moved."""
-        (row,) = self.aligned.rows_of([(k, i)])
-        return self.aligned.T_old_new[row, self.best[row]]
+    return chosen(
+        halves_of(compared, cuts, [(o.points, o.normals) for o in objects]),
+        wholes,
+        lambda parts, others: {
+            (i, part): z
+            for (part, i), z in compared.odds_of_others(
+                map(half, parts), [compared.new[i] for i in others]
+            ).items()
+        },
+    )
 
-    @cached_property
-    def best(self) -> Int[np.ndarray, " p"]:
-        """Which of the poses of every aligned pair fits best."""
-        return evidence_at(self.aligned, self.matcher.search, self.config.motion, self.height_m()).pose
 
-    def height_m(self) -> float:
-        """The common height, upright."""
-        return float(self.identified.frame.T_scene_scan[2, 3]) if self.config.motion == "upright" else 0.0
-
-    def odds_of_found(self, side: int) -> dict[int, float]:
-        """Log odds of the pairs found, by their rows of objects (side 0) or of instances (1)."""
-        pairs = [(f.object, f.instance) for f in self.identified.found]
-        odds = odds_of(self.aligned, self.matcher.search, self.config.motion, self.height_m())
-        value = odds.value[self.aligned.rows_of(pairs)]
-        return {pair[side]: float(z) for pair, z in zip(pairs, value, strict=True)}
-
-    def odds_of_halves(
-        self, old: Iterable[ObservedObject], new: Iterable[ObservedObject]
-    ) -> dict[tuple[int, int], float]:
-        """Log odds of halves with what they may be, by rows of `old` and `new`."""
-        matcher = dataclasses.replace(self.matcher, candidates=CANDIDATES)
-        T = self.identified.frame.T_scene_scan
-        sides, seen = (list(old), list(new)), self.aligned.seen
-        aligned = align_candidates(self.prior, *sides, matcher, self.config.motion, T, seen)
-        odds = odds_of(aligned, matcher.search, self.config.motion, self.height_m())
-        return {(k, i): z for (k, i), z in zip(odds.pairs.tolist(), odds.value.tolist(), strict=True)}
-
-    def halves(
-        self, cuts: dict[int, list[Cut]], clouds: Sequence[tuple[Points, Normals | None]]
-    ) -> list[tuple[Part, Part]]:
-        """Both sides of every cut with their codes, the larger first."""
-        every = [
-            (w, side, narrow)
-            for w, of_whole in cuts.items()
-            for rows, narrow in of_whole
-            for side in larger_first(rows)
-        ]
-        if not every:
+def cuts_of(compared: Comparison, points: Points, partner: Points | None) -> list[Cut]:
+    """How a cloud may fall in two: beside what it was found to be, and where it is thinnest."""
+    first: list[Cut] = []
+    if partner is not None:
+        rest = beside_of(partner, points)
+        if rest.mean() < LEAST_PART:
             return []
-        normals = [None if n is None else n[rows] for w, rows, _ in every for n in (clouds[w][1],)]
-        codes = embed(self.prior, [clouds[w][0][rows] for w, rows, _ in every], normals)
-        parts = [
-            Part(whole=w, rows=r, embedding=e, narrow=n) for (w, r, n), e in zip(every, codes, strict=True)
-        ]
-        return list(zip(parts[::2], parts[1::2], strict=True))
+        first = [(rest, False)]
+    thin = thinnest_cuts(points, CUTS, LEAST_PART)
+    first = first or thin[:1]
+    cuts = [*first, *(c for c in thin if c[1] and c is not first[0])]
+    fewest = max(compared.config.min_points, LEAST_PART * len(points))
+    return [c for c in cuts if min(c[0].sum(), (~c[0]).sum()) >= fewest]
+
+
+def halves_of(
+    compared: Comparison, cuts: dict[int, list[Cut]], clouds: Sequence[tuple[Points, Normals | None]]
+) -> list[tuple[Part, Part]]:
+    """Both sides of every cut with their codes, the larger first."""
+    every = [
+        (w, side, narrow)
+        for w, of_whole in cuts.items()
+        for rows, narrow in of_whole
+        for side in larger_first(rows)
+    ]
+    if not every:
+        return []
+    normals = [None if n is None else n[rows] for w, rows, _ in every for n in (clouds[w][1],)]
+    codes = embed(compared.prior, [clouds[w][0][rows] for w, rows, _ in every], normals)
+    parts = [Part(whole=w, rows=r, embedding=e, narrow=n) for (w, r, n), e in zip(every, codes, strict=True)]
+    return list(zip(parts[::2], parts[1::2], strict=True))
 
 
 def wholes_of(

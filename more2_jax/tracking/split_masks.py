@@ -40,11 +40,6 @@ class Mended:
     object_parts: frozenset[int] = frozenset()
     repairs: tuple[Repair, ...] = ()
 
-    @property
-    def absorbed(self) -> frozenset[str]:
-        """Ids of the objects that are parts of others."""
-        return frozenset(id_ for r in self.repairs for id_ in r.absorbed)
-
     def left_over(self, found: Sequence[tuple[int, int]]) -> tuple[list[int], list[int]]:
         """Rows of the objects and of the instances that were neither found nor are parts of others."""
         objects, instances = ({pair[side] for pair in found} for side in (0, 1))

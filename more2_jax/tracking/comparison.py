@@ -1,0 +1,98 @@
+"""Two scans as they were compared: the poses and odds of their pairs, and of other clouds in their places."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Int
+
+from more2_jax.config import EvidenceMatcher, SceneConfig
+from more2_jax.geometry.poses import Pose
+from more2_jax.matching.assignment import NEVER
+from more2_jax.matching.calibration import even_odds
+from more2_jax.matching.candidates import AlignedPairs, align_candidates, evidence_at, odds_of
+from more2_jax.network.prior import Prior
+from more2_jax.tracking.identify import Identified
+from more2_jax.types import ObservedObject
+
+CANDIDATES = 3  # partners of every cloud that are aligned
+
+
+@dataclass(frozen=True, kw_only=True)
+class Comparison:
+    """Objects and instances as they were compared."""
+
+    prior: Prior
+    old: Sequence[ObservedObject]
+    new: Sequence[ObservedObject]
+    identified: Identified
+    aligned: AlignedPairs
+    matcher: EvidenceMatcher
+    config: SceneConfig
+
+    @classmethod
+    def of(
+        cls,
+        prior: Prior,
+        old: Sequence[ObservedObject],
+        new: Sequence[ObservedObject],
+        identified: Identified,
+        config: SceneConfig,
+    ) -> Comparison | None:
+        """The comparison; None where nothing is known of surfaces (`CodeMatcher`)."""
+        if not isinstance(config.matching, EvidenceMatcher) or identified.aligned is None:
+            return None
+        return cls(
+            prior=prior,
+            old=old,
+            new=new,
+            identified=identified,
+            aligned=identified.aligned,
+            matcher=config.matching,
+            config=config,
+        )
+
+    def best_pose(self, k: int, i: int) -> Pose:
+        """The pose of a pair that fits best: T_scene_scan as if the object had not moved."""
+        (row,) = self.aligned.rows_of([(k, i)])
+        return self.aligned.T_old_new[row, self.best[row]]
+
+    @cached_property
+    def best(self) -> Int[np.ndarray, " p"]:
+        """Which of the poses of every aligned pair fits best."""
+        return evidence_at(self.aligned, self.matcher.search, self.config.motion, self.height_m()).pose
+
+    def height_m(self) -> float:
+        """The common height, upright."""
+        return float(self.identified.frame.T_scene_scan[2, 3]) if self.config.motion == "upright" else 0.0
+
+    def odds_of_found(self, side: int) -> dict[int, float]:
+        """Log odds of the pairs found, by their rows of objects (side 0) or of instances (1)."""
+        pairs = [(f.object, f.instance) for f in self.identified.found]
+        odds = odds_of(self.aligned, self.matcher.search, self.config.motion, self.height_m())
+        value = odds.value[self.aligned.rows_of(pairs)]
+        return {pair[side]: float(z) for pair, z in zip(pairs, value, strict=True)}
+
+    @property
+    def even_odds(self) -> float:
+        """The log odds here of an even chance."""
+        return even_odds(self.matcher.search, self.config.motion)
+
+    def odds_of_pair(self, old: ObservedObject, new: ObservedObject) -> float:
+        """Log odds of one pair of clouds; `NEVER` where they are not even proposed."""
+        return self.odds_of_others([old], [new]).get((0, 0), NEVER)
+
+    def odds_of_others(
+        self, old: Iterable[ObservedObject], new: Iterable[ObservedObject]
+    ) -> dict[tuple[int, int], float]:
+        """Log odds of clouds of both scans that were not compared, by rows of `old` and `new`."""
+        matcher = dataclasses.replace(self.matcher, candidates=CANDIDATES)
+        T = self.identified.frame.T_scene_scan
+        sides, seen = (list(old), list(new)), self.aligned.seen
+        aligned = align_candidates(self.prior, *sides, matcher, self.config.motion, T, seen)
+        odds = odds_of(aligned, matcher.search, self.config.motion, self.height_m())
+        return {(k, i): z for (k, i), z in zip(odds.pairs.tolist(), odds.value.tolist(), strict=True)}

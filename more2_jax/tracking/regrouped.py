@@ -1,0 +1,46 @@
+"""Objects and instances after masks were joined and divided, and what that is said of."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from more2_jax.tracking.identify import Found
+from more2_jax.types import Embedding, Instance, Repair, SceneObject
+
+
+@dataclass(frozen=True, kw_only=True)
+class JoinedMask:
+    """Masks of one scan that are one instance now."""
+
+    instances: tuple[int, ...]  # ids; the first is that of the whole
+    share: float  # of the part's points that lie on the object
+
+
+@dataclass(frozen=True, kw_only=True)
+class Regrouped:
+    """Objects and instances; of those divided the larger half in the place of the whole, the smaller at the end."""
+
+    objects: list[SceneObject]
+    instances: list[Instance]
+    embeddings: list[Embedding]  # of the instances
+    halves: tuple[tuple[int, int], ...] = ()  # rows of instances that are one mask
+    joined: tuple[JoinedMask, ...] = ()
+    repairs: tuple[Repair, ...] = ()  # of objects
+
+    def masks(self, found: Sequence[Found], fresh: Mapping[int, SceneObject]) -> tuple[Repair, ...]:
+        """The masks of this scan that were joined or divided. `fresh`: new objects by the rows of their instances."""
+        names = {f.instance: self.objects[f.object].id for f in found} | {i: o.id for i, o in fresh.items()}
+        by_id = {self.instances[i].id: name for i, name in reversed(names.items())}
+        return (
+            *(
+                Repair(object=by_id[j.instances[0]], instances=j.instances, share=j.share)
+                for j in self.joined
+                if j.instances[0] in by_id
+            ),
+            *(
+                Repair(object=names[i], instances=(self.instances[i].id,), divided=names[j])
+                for i, j in self.halves
+                if i in names and j in names
+            ),
+        )
