@@ -30,7 +30,9 @@ from more2_jax.types import Instance, ObservedObject, Repair, SceneObject
 
 # Chosen on rooms of regimes `paper`, `sparse` and `real`, docs/developing/notebook/mask_repair.md.
 TOUCHING = 2.0  # distances between neighboring points: parts of one surface lie no farther apart
-LEAST_TOUCHING = 0.5  # of as many points as a line across the smaller has: that many of both lie so near the other
+LEAST_TOUCHING = (
+    0.5  # of as many points as a line across the smaller has: that many of both lie so near the other
+)
 LEAST_ON = 0.3  # share of a part that must lie on the other scan's object, which may be a part itself
 LIKELY = 1.0  # log odds beyond an even chance: what is so likely an object of its own
 LEAST_GAIN = 1.0  # is joined where both together are so much likelier than the likelier of them
