@@ -30,8 +30,6 @@ from more2_jax.matching.candidates import align_candidates, odds_of
 from more2_jax.network.embedding_batch import embed
 from more2_jax.types import ObservedObject
 
-pytestmark = pytest.mark.no_cover
-
 PLANTED = Calibration(
     intercept=2.0, apart_less=-6.0, apart_more=0.0, contradicted=-3.0, likeness=4.0, off_less=-5.0
 )

@@ -13,8 +13,6 @@ from more2_jax.network.embedding_batch import embed
 from more2_jax.network.prior import load_prior
 from more2_jax.types import Instance, Scan
 
-pytestmark = pytest.mark.no_cover
-
 CONFIG = preset("robust", upright=True)
 TRUE = turn_z(0.7, np.zeros(3), np.array([1.0, -2.0, 0.0]))  # T_target_source
 SLIP = turn_z(np.deg2rad(1.0), np.zeros(3), np.array([0.004, -0.003, 0.0]))

@@ -17,8 +17,6 @@ from more2_jax.network.prior import load_prior, save_prior
 from more2_jax.types import Embedding
 from train.run.settings import TrainingConfig
 
-pytestmark = pytest.mark.no_cover
-
 SMALL = """
 model:
   encoder:

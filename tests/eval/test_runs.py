@@ -25,8 +25,6 @@ from more2_jax.network.embedding_batch import embed
 from more2_jax.network.prior import save_prior
 from more2_jax.types import ObservedObject
 
-pytestmark = pytest.mark.no_cover
-
 
 @pytest.fixture
 def data(tmp_path):

@@ -18,8 +18,6 @@ from eval.harness.shards import shard_of
 from eval.scores.figures import Figure
 from more2_jax.network.prior import save_prior
 
-pytestmark = pytest.mark.no_cover
-
 NAMES = [f"scene_{k}" for k in range(7)]
 DATED = ("date",)  # of results.json: when, not what
 

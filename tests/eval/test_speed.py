@@ -13,8 +13,6 @@ from more2_jax.config import load_config
 from more2_jax.network.prior import init_prior
 from train.run.settings import TrainingRun
 
-pytestmark = pytest.mark.no_cover
-
 
 @pytest.fixture(scope="module")
 def small():

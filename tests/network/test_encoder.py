@@ -16,8 +16,6 @@ from more2_jax.network.prior import Prior, encode, encode_one, init_prior
 from more2_jax.types import Embedding, PointCloud
 from train.run.settings import TrainingRun
 
-pytestmark = pytest.mark.no_cover
-
 CONFIGS = ROOT / "configs"
 POINTS, BATCH = 512, 8  # what clouds are padded to and how many there are, of choice: compiled once a prior
 LEAVES = ("inv", "eqv", "scale", "center")

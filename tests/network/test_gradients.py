@@ -12,8 +12,6 @@ import pytest
 from more2_jax.network.prior import encode, sdf
 from more2_jax.types import Embedding, PointCloud
 
-pytestmark = pytest.mark.no_cover
-
 REAL = 90, 110  # points of the two clouds; the rest of the rows is padding
 ROWS, QUERIES, STEP = 128, 20, 1e-8
 MASK = np.arange(ROWS) < np.array(REAL)[:, None]

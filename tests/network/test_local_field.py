@@ -29,8 +29,6 @@ from more2_jax.scene import start_scene
 from more2_jax.types import Anchors, Instance, Scan
 from train.run.settings import TrainingRun
 
-pytestmark = pytest.mark.no_cover
-
 CHANNELS, BANDWIDTHS, INPUTS = 4, (0.1, 0.3), 6
 encoded, distance = jax.jit(encode_one), jax.jit(sdf_one)
 

@@ -17,8 +17,6 @@ from more2_jax.network.prior import encode
 from more2_jax.refinement import joint
 from more2_jax.refinement.joint import Observations, code_drift, fit_jointly, surface_loss
 
-pytestmark = pytest.mark.no_cover
-
 POINTS, OBJECTS, SEEN = 128, 3, 4  # every object seen three times, and one row of padding
 CONFIG = JointConfig(
     points=POINTS,

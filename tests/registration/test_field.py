@@ -20,8 +20,6 @@ from more2_jax.registration.pair_batch import batch_of, pair_up
 from more2_jax.registration.pose_costs import off_fields
 from more2_jax.registration.register_pairs import register
 
-pytestmark = pytest.mark.no_cover
-
 POINTS = 512  # of every cloud
 PIECES = 4
 # Fewer points and starts than the preset: the clouds are clean and whole.

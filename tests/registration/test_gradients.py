@@ -16,8 +16,6 @@ from more2_jax.registration.pair_batch import batch_of, pair_up
 from more2_jax.registration.register_pairs import register
 from more2_jax.types import PointCloud
 
-pytestmark = pytest.mark.no_cover
-
 COUNT = 64
 MASK = np.ones((2, COUNT), bool)  # closed over by what is compiled
 DESCENT = DescentRegistration(points=32, sdf_points=32, steps=5, icp_steps=2)

@@ -26,8 +26,6 @@ from more2_jax.registration.register_pairs import register
 from more2_jax.registration.search import scaled_pose
 from more2_jax.types import ObservedObject
 
-pytestmark = pytest.mark.no_cover
-
 POINTS = 512  # of every cloud registered by surfaces here: compiled once a prior
 # Fewer points than the preset: the clouds are clean, and what is tested is the same.
 SURFACE = SurfaceRegistration(search=SurfaceSearch(points=64, dense=256, cells=16, keep=4))
