@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import os
 import re
+from collections.abc import Callable
 from contextlib import redirect_stdout, suppress
 from unittest.mock import patch
 
@@ -39,9 +40,14 @@ def section(words: list[str]) -> str:
 
 
 def help_of(words: list[str]) -> str:
-    """What a command prints when it is asked for help, without colors."""
+    """What a command prints when it is asked for help."""
+    return printed_help(lambda: main([*words, "--help"]))
+
+
+def printed_help(ask: Callable[[], object]) -> str:
+    """What `ask` prints before it ends the program, without colors."""
     printed = io.StringIO()
     plain = patch.dict(os.environ, {"COLUMNS": str(WIDTH), "NO_COLOR": "1"})
     with plain, redirect_stdout(printed), suppress(SystemExit):  # with which help ends
-        main([*words, "--help"])
+        ask()
     return "\n".join(line.rstrip() for line in printed.getvalue().splitlines()).strip()

@@ -1,4 +1,4 @@
-"""docs/reference/settings.md: every settings class, with defaults and meanings, both presets side by side."""
+"""docs/reference/settings.md: every settings class, with defaults and meanings, all presets side by side."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from train.run.settings import TrainingConfig
 
 HEAD = """# Settings
 
-Every setting with its value in the presets `paper` and `robust`, and what it means. From Python, `m2.preset("robust")`
-gives them and `dataclasses.replace` changes them. On the command line, `--config` names a YAML file that replaces
-values. `more2 settings --preset robust` prints those of one preset.
+Every setting with its value in the presets `paper`, `field` and `robust`, and what it means. From Python,
+`m2.preset("robust")` gives them and `dataclasses.replace` changes them. On the command line, `--config` names a YAML
+file that replaces values. `more2 settings --preset robust` prints those of one preset.
 
 ```yaml
 static_m: 0.1
@@ -28,12 +28,13 @@ METHOD = "## The method\n"
 TRAINING = """## Network and training
 What `python -m train.prior` reads from a YAML file.
 """
+PRESETS = ("paper", "field", "robust")  # columns of the table
 ABSENT = ""  # of a setting of an algorithm that the preset does not use
 
 
 def settings_reference() -> str:
     """Markdown: the scene and its algorithms, then the network and its training."""
-    presets = {name: preset(name) for name in ("paper", "robust")}
+    presets = {name: preset(name) for name in PRESETS}
     sections = [METHOD, *scene_sections(SceneConfig, "", presets), TRAINING]
     for settings, where in ((PriorConfig, "model"), (TrainingConfig, "training")):
         sections += default_sections(settings, where)
@@ -57,7 +58,8 @@ def scene_sections(settings: type, where: str, values: dict[str, Any]) -> Iterat
         )
     users = [p for p, v in values.items() if isinstance(v, settings)]
     yield heading(settings, where, "" if len(users) == len(values) else f" Used by `{'`, `'.join(users)}`.")
-    yield "\n".join(["| setting | type | paper | robust | meaning |", "|---|---|---|---|---|", *rows, ""])
+    head = f"| setting | type | {' | '.join(values)} | meaning |"
+    yield "\n".join([head, "|---|---|---|---|---|---|", *rows, ""])
     for c, name, held in inner:
         yield from scene_sections(c, name, {p: held.get(p) for p in values})
 

@@ -43,6 +43,7 @@ registration:
   steps: 2
   polish_steps: 2
   search: {points: 32, dense: 64, cells: 8, turns: 4, steps: 2, keep: 1}
+pose_graph: {steps: 2}
 joint: {points: 64, steps: 2}
 meshing: {coarse: 8, resolution: 16}
 """

@@ -18,33 +18,36 @@ C = TypeVar("C")
 class EncoderConfig:
     """Encoder Φ (paper §3.1); the defaults are the published widths."""
 
-    widths: tuple[int, ...] = (32, 32, 64, 64, 128, 256, 512)
-    code: int = 256
-    neighbors: int = 16
-    linear_blocks: int = 2  # the first blocks have no attention
-    head_channels: int = 16
-    downsample_blocks: tuple[int, ...] = (2, 4, 5)  # 0-based: thinned on entering these
-    downsample_factors: tuple[int, ...] = (2, 4, 4)
-    leak: float = 0.2
-    output_scale: float = 64000.0  # F_s and F_c are in units of this; chosen so that F_s ≈ 1 at step 0
-    points: int = 1024  # input size after farthest-point sampling
+    widths: tuple[int, ...] = (32, 32, 64, 64, 128, 256, 512)  # Channels of every block.
+    code: int = 256  # Channels of F_inv, and vectors of F_eqv.
+    neighbors: int = 16  # Nearest points that a point looks at, in feature space.
+    linear_blocks: int = 2  # The first blocks have no attention.
+    head_channels: int = 16  # Channels of one head of attention.
+    # The points are thinned on entering these blocks, counted from 0.
+    downsample_blocks: tuple[int, ...] = (2, 4, 5)
+    downsample_factors: tuple[int, ...] = (2, 4, 4)  # One point of so many stays, at each of them.
+    leak: float = 0.2  # Slope of the leaky ReLU.
+    # F_s and F_c are in units of this, chosen so that F_s is about 1 at step 0.
+    output_scale: float = 64000.0
+    points: int = 1024  # Input size after farthest-point sampling.
 
 
 @dataclass(frozen=True)
 class DecoderConfig:
     """Decoder Ψ (paper §3.1), a DeepSDF network."""
 
-    hidden: int = 768
-    layers: int = 8  # hidden layers
-    skip_layer: int = 4  # 0-based: the input is concatenated before this one
-    dropout: float = 0.2  # while training
-    narrow_skip: bool = True  # as published: the layer before gives way, so that the skip layer sees `hidden`
-    local_blocks: tuple[
-        int, ...
-    ] = ()  # 0-based encoder blocks whose points and features the decoder looks up
-    local_channels: int = 16  # of every level and bandwidth
-    bandwidths: tuple[float, ...] = (0.05, 0.15)  # at the start of training, canonical units
-    normals: bool = False  # the anchors' normals, where they are known, are looked up too
+    hidden: int = 768  # Width of the hidden layers.
+    layers: int = 8  # How many hidden layers there are.
+    skip_layer: int = 4  # The input is concatenated before this layer, counted from 0.
+    dropout: float = 0.2  # Share of a layer's outputs that are dropped while training.
+    # As published: the layer before gives way, so that the skip layer sees `hidden` numbers.
+    narrow_skip: bool = True
+    # The decoder looks up points and features of these encoder blocks, counted from 0.
+    local_blocks: tuple[int, ...] = ()
+    local_channels: int = 16  # Channels of every level and bandwidth that is looked up.
+    # Widths of the look-up when training starts, canonical units.
+    bandwidths: tuple[float, ...] = (0.05, 0.15)
+    normals: bool = False  # The anchors' normals are looked up too, where they are known.
 
 
 @dataclass(frozen=True)
@@ -53,9 +56,9 @@ class PriorConfig:
 
     encoder: EncoderConfig = field(default_factory=EncoderConfig)
     decoder: DecoderConfig = field(default_factory=DecoderConfig)
-    eqv_gain: float = 1.0
-    inv_gain: float = 1.0
-    bare_decoder: bool = False  # a second decoder for objects of which no normal is known
+    eqv_gain: float = 1.0  # F_eqv is multiplied by this for the decoder.
+    inv_gain: float = 1.0  # F_inv is multiplied by this for the decoder.
+    bare_decoder: bool = False  # Whether a second decoder answers for objects of which no normal is known.
 
 
 @dataclass(frozen=True)
@@ -66,43 +69,41 @@ class SurfaceSearch:
     docs/developing/notebook/registration_parts.md.
     """
 
-    turns: int = (
-        24  # starts about the vertical, upright; in any orientation the 60 rotations of an icosahedron
-    )
-    points: int = 128  # of either cloud, compared with
-    dense: int = 1024  # so many of the other, found by a table
-    cells: int = 24  # a side of that table
-    steps: int = 12  # of alignment, of every start
-    first_reach: float = 0.3  # correspondences this far apart count a quarter, in the first step
-    last_reach: float = 0.1  # and in the last
-    keep: int = 6  # poses, each turned otherwise
-    truncation: float = 0.2  # a point farther from the other cloud counts as this far
-    lift_weight: float = 0.1  # upright: cost of a pose that changes the object's height
-    free_weight: float = 1.0  # upright: cost of lying where the other scan's sensors looked through, if known
-    field_weight: float = 2.0  # cost of lying off the surface that the prior completes the other cloud to
+    # Starts about the vertical, if upright. In any orientation the 60 rotations of an icosahedron are tried.
+    turns: int = 24
+    points: int = 128  # So many points of either cloud are compared with the other.
+    dense: int = 1024  # So many points of the other are found by a table.
+    cells: int = 24  # The table has so many cells a side.
+    steps: int = 12  # Every start is aligned by so many steps.
+    first_reach: float = 0.3  # In the first step, correspondences this far apart count a quarter.
+    last_reach: float = 0.1  # In the last step, these do.
+    keep: int = 6  # So many poses are kept, each turned otherwise.
+    truncation: float = 0.2  # A point farther from the other cloud counts as this far.
+    lift_weight: float = 0.1  # Cost of a pose that changes the object's height, if upright.
+    # Cost of lying where the other scan's sensors looked through, if upright and known.
+    free_weight: float = 1.0
+    field_weight: float = 2.0  # Cost of lying off the surface that the prior completes the other cloud to.
 
 
 @dataclass(frozen=True)
 class CodeMatcher:
     """Matching by the embeddings alone (paper §3.2)."""
 
-    method: Literal["codes"] = "codes"  # names these settings
-    score: Literal["inv", "eqv", "both"] = "both"  # Λ, 1/E, Λ ⊘ E
-    assignment: Literal["hungarian", "greedy"] = (
-        "hungarian"  # the best total, or (published code) best pair first
-    )
+    method: Literal["codes"] = "codes"  # It names these settings.
+    score: Literal["inv", "eqv", "both"] = "both"  # What pairs are scored by: Λ, 1/E or Λ ⊘ E.
+    # The best total, or (published code) the best pair first.
+    assignment: Literal["hungarian", "greedy"] = "hungarian"
 
 
 @dataclass(frozen=True)
 class EvidenceMatcher:
     """Matching by surfaces: the embeddings propose pairs, how well a pair's surfaces fit decides (beyond the paper)."""
 
-    method: Literal["evidence"] = "evidence"  # names these settings
-    candidates: int = 8  # partners of every object, and of every instance, that are aligned; 0: all
-    size_weight: float = (
-        0.5  # of |log| of the ratio of the F_s, against the cosine of the F_inv, in what is proposed
-    )
-    motion_weight: float = 0.2  # log odds that a meter moved costs: decides among identical objects
+    method: Literal["evidence"] = "evidence"  # It names these settings.
+    candidates: int = 8  # So many partners of every object, and of every instance, are aligned. 0: all are.
+    # In what is proposed: weight of |log| of the ratio of the F_s against the cosine of the F_inv.
+    size_weight: float = 0.5
+    motion_weight: float = 0.2  # Log odds that a meter moved costs. It decides among identical objects.
     # Its evidence is calibrated on poses found without free space, which has its say when they are refined.
     search: SurfaceSearch = SurfaceSearch(free_weight=0.0)
 
@@ -111,19 +112,18 @@ class EvidenceMatcher:
 class DescentRegistration:
     """Registration by descent on the signed distance field, then ICP (paper §3.3)."""
 
-    method: Literal["descent"] = "descent"  # names these settings
-    points: int = 1024  # of the farthest-point samples
-    sdf_points: int = 1024  # of them, how many are asked of the field
-    steps: int = 200  # Adam on SE(3)
-    learning_rate: float = 1e-3  # radians, and shares of the target's radius
-    sdf_weight: float = 1.0  # of |Ψ| at the moved source's points, in the loss
-    chamfer_weight: float = 1.0  # of the Chamfer distance
-    chamfer: Literal["squared", "plain"] = (
-        "squared"  # of nearest distances, the mean of the squares (paper, supplement), or their own
-    )
-    icp_steps: int = 30  # after the descent
-    trim: float = 1.0  # share of nearest distances that counts
-    converged_rms: float = 0.05  # share of the target's radius
+    method: Literal["descent"] = "descent"  # It names these settings.
+    points: int = 1024  # Size of the farthest-point samples.
+    sdf_points: int = 1024  # The field is asked at so many of them.
+    steps: int = 200  # Steps of Adam on SE(3).
+    learning_rate: float = 1e-3  # Radians, and shares of the target's radius.
+    sdf_weight: float = 1.0  # Weight in the loss of |Ψ| at the moved source's points.
+    chamfer_weight: float = 1.0  # Weight in the loss of the Chamfer distance.
+    # The mean of the nearest distances' squares (paper, supplement), or of the distances themselves.
+    chamfer: Literal["squared", "plain"] = "squared"
+    icp_steps: int = 30  # Steps of ICP after the descent.
+    trim: float = 1.0  # This share of the nearest distances counts.
+    converged_rms: float = 0.05  # A pose with a lower residual has converged; a share of the target's radius.
 
 
 @dataclass(frozen=True)
@@ -133,42 +133,43 @@ class SurfaceRegistration:
     Refines the poses that matching found, or those of `search` where it is given none.
     """
 
-    method: Literal["surface"] = "surface"  # names these settings
+    method: Literal["surface"] = "surface"  # It names these settings.
     search: SurfaceSearch = field(default_factory=SurfaceSearch)
-    try_stayed: bool = True  # also "it did not move", which is chosen if it fits nearly as well as the best
-    points: int = 256  # of each cloud, compared with all of the other
-    steps: int = 15  # of alignment, of every pose
-    first_reach: float = 0.1  # of a correspondence, in the first step
-    last_reach: float = 0.03  # and in the last
-    choose_among: int = (
-        3  # refined poses, each turned otherwise, that the prior tells apart; and "it did not move"
-    )
-    field_points: int = 1024  # of each cloud, asked of the other's completed surface
-    polish_points: int = 512  # then, for the best pose alone
-    polish_steps: int = 10  # of alignment, of the best pose
-    polish_reach: float = 0.02  # of a correspondence, in its last step
-    trim: float = 0.7  # share of nearest distances that counts in the residual
-    converged_rms: float = 0.05  # residual below which a pose that has settled is called converged
+    # "It did not move" is tried, too, and chosen if it fits nearly as well as the best.
+    try_stayed: bool = True
+    points: int = 256  # So many points of each cloud are compared with all of the other.
+    steps: int = 15  # Every pose is aligned by so many steps.
+    first_reach: float = 0.1  # Reach of a correspondence in the first step.
+    last_reach: float = 0.03  # Reach of a correspondence in the last step.
+    # The prior tells so many refined poses apart, each turned otherwise, and "it did not move".
+    choose_among: int = 3
+    field_points: int = 1024  # So many points of each cloud are asked of the other's completed surface.
+    polish_points: int = 512  # So many points are compared for the best pose alone, in the end.
+    polish_steps: int = 10  # The best pose is aligned by so many steps more.
+    polish_reach: float = 0.02  # Reach of a correspondence in the last of these.
+    trim: float = 0.7  # This share of the nearest distances counts in the residual.
+    converged_rms: float = 0.05  # A pose that has settled has converged if its residual is lower.
 
 
 @dataclass(frozen=True)
 class FieldRegistration:
     """Registration on the completed surfaces alone (beyond the paper, without ICP); lengths in shares of the radius."""
 
-    method: Literal["field"] = "field"  # names these settings
-    turns: int = (
-        24  # of the codes' rotation, about the vertical, upright; in any orientation all 60 of an icosahedron
-    )
-    search_points: int = 64  # of each cloud, asked of the other's field while all starts are aligned
-    search_steps: int = 6  # of Gauss-Newton, of every start
-    first_reach: float = 0.3  # a point so far off the surface counts a quarter, in the first step
-    search_reach: float = 0.1  # in the last of the search, and the first that refines
-    keep: int = 4  # poses, each turned otherwise, that are refined
-    points: int = 512  # of each cloud, then
-    steps: int = 10  # of Gauss-Newton, of the poses that are refined
-    last_reach: float = 0.02  # in the last of these
-    trim: float = 0.7  # share of nearest distances that counts in the residual
-    converged_rms: float = 0.05  # residual below which a pose that has settled is called converged
+    method: Literal["field"] = "field"  # It names these settings.
+    # Turns of the codes' rotation about the vertical, if upright. In any orientation all 60 of an icosahedron are
+    # tried.
+    turns: int = 24
+    # So many points of each cloud are asked of the other's field while all starts are aligned.
+    search_points: int = 64
+    search_steps: int = 6  # Steps of Gauss-Newton that align every start.
+    first_reach: float = 0.3  # A point so far off the surface counts a quarter in the first step.
+    search_reach: float = 0.1  # The same in the last step of the search, and in the first that refines.
+    keep: int = 4  # So many poses are refined, each turned otherwise.
+    points: int = 512  # So many points of each cloud are asked then.
+    steps: int = 10  # Steps of Gauss-Newton that refine those poses.
+    last_reach: float = 0.02  # A point so far off the surface counts a quarter in the last of these steps.
+    trim: float = 0.7  # This share of the nearest distances counts in the residual.
+    converged_rms: float = 0.05  # A pose that has settled has converged if its residual is lower.
 
 
 Matcher = CodeMatcher | EvidenceMatcher
@@ -182,15 +183,14 @@ PresetName = Literal["robust", "field", "paper"]
 class JointConfig:
     """Joint optimization of code and poses (paper §3.5); the defaults are the paper's."""
 
-    steps: int = 200  # of Adam. 0: codes and poses stay
-    points: int = 1024  # farthest points of every observation
-    start: Literal["best", "accumulated"] = (
-        "best"  # F_0: the code of the observation with the lowest loss, or that of all together
-    )
-    eqv_learning_rate: float = 1e-4  # of Adam, for F_eqv,
-    pose_learning_rate: float = 5e-5  # the poses (radians, and shares of the radius),
-    inv_learning_rate: float = 1e-5  # F_inv,
-    center_learning_rate: float = 1e-5  # and F_c
+    steps: int = 200  # Steps of Adam. 0: codes and poses stay.
+    points: int = 1024  # Farthest points taken of every observation.
+    # F_0 is the code of the observation with the lowest loss, or that of all together.
+    start: Literal["best", "accumulated"] = "best"
+    eqv_learning_rate: float = 1e-4  # Learning rate of F_eqv.
+    pose_learning_rate: float = 5e-5  # Learning rate of the poses: radians, and shares of the radius.
+    inv_learning_rate: float = 1e-5  # Learning rate of F_inv.
+    center_learning_rate: float = 1e-5  # Learning rate of F_c.
 
 
 @dataclass(frozen=True)
@@ -201,50 +201,52 @@ class MeshingConfig:
     docs/developing/notebook/mesh_surface.md.
     """
 
-    coarse_resolution: int = 32  # cells a side of the first grid
-    resolution: int = 64  # of the last: `coarse_resolution`, doubled some times
-    field_resolution: int = (
-        0  # the finest grid that the network is asked on; finer ones interpolate. 0: all ask
-    )
-    level: Literal["zero", "observed"] = (
-        "zero"  # the surface's level: 0, or the field's median at the observed points
-    )
-    mls_bandwidth: float = 0.0  # of implicit moving least squares at observed points. 0: the field alone
-    # ℓ of the screened Poisson equation, on grids finer than `field_resolution`: so near to observed points their
-    # normals say what is inside, farther off the field does. 0: no such equation.
+    coarse_resolution: int = 32  # The first grid has so many cells a side.
+    resolution: int = 64  # The last grid has so many: `coarse_resolution`, doubled some times.
+    # Cells a side of the finest grid that the network is asked on; finer ones interpolate. 0: all ask.
+    field_resolution: int = 0
+    # The surface is where the field is 0, or its median at the observed points.
+    level: Literal["zero", "observed"] = "zero"
+    # Bandwidth of implicit moving least squares at observed points. 0: the field alone decides.
+    mls_bandwidth: float = 0.0
+    # ℓ of the screened Poisson equation, on grids finer than `field_resolution`. So near to observed points their
+    # normals say what is inside, farther off the field does. 0: there is no such equation.
     screening_length: float = 0.0
-    screening_length_multi_scan: float = 0.0  # of points without noise that several scans saw. 0: the same
-    # Points with a larger local outlier factor are left out. 0: all points stay.
-    outlier_factor: float = 0.0
-    outlier_factor_multi_scan: float = 0.0  # where several scans saw the object, and confirm one another
-    clip_to_floor: bool = False  # of upright scans with a visible floor: nothing reaches below it
+    # The same for points without noise that several scans saw. 0: as for one scan.
+    screening_length_multi_scan: float = 0.0
+    outlier_factor: float = 0.0  # Points with a larger local outlier factor are left out. 0: all points stay.
+    # The same where several scans saw the object, and confirm one another.
+    outlier_factor_multi_scan: float = 0.0
+    clip_to_floor: bool = False  # Nothing reaches below the floor, where scans are upright and show it.
 
 
 @dataclass(frozen=True)
 class PoseGraphConfig:
     """Pose-graph optimization of all observations of an object, before its mesh is made; not in the paper."""
 
-    steps: int = 0  # of Gauss-Newton. 0: poses stay as registered
+    steps: int = 0  # Steps of Gauss-Newton. 0: poses stay as registered.
 
 
 @dataclass(frozen=True)
 class SceneConfig:
     """The whole method; `preset('paper')` follows the paper, `preset('robust')` is the default."""
 
-    preset: str = "paper"  # whose settings these are, or began as
-    # Objects turn about the vertical (z) only; None: where the first scan shows a level floor.
+    preset: str = "paper"  # Whose settings these are, or began as.
+    # Objects turn about the vertical (z) only. None: they do where the first scan shows a level floor.
     upright: bool | None = None
-    min_points: int = 64  # objects seen with fewer are skipped, and reported
-    static_deg: float = 1.0  # an object that turned by less,
-    static_m: float = 0.05  # and moved by less, is static
-    # Match and register against all seen so far, not the reference observation.
+    min_points: int = 64  # Objects seen with fewer points are skipped, and reported.
+    # An object is static that turned by less, degrees, and moved by less than `static_m`.
+    static_deg: float = 1.0
+    # An object is static that moved by less, meters, and turned by less than `static_deg`.
+    static_m: float = 0.05
+    # Match and register against all seen so far, not against the reference observation.
     accumulate_target: bool = False
-    # What pairs that are registered together, and objects that are meshed side by side, may take of the memory beside
-    # the scene; results do not depend on it.
+    # What pairs that are registered together, and objects that are meshed side by side, may take of the memory
+    # beside the scene. Results do not depend on it.
     memory_mb: int = 1024
     # Join what masks split, divide what they merge, leave out floor and neighbors, take in what they cut off.
     repair_masks: bool = False
-    accumulate_misfit: float = 1.0  # an observation whose registration fits worse is left out of the shape
+    accumulate_misfit: float = 1.0  # An observation whose registration fits worse is left out of the shape.
     matching: Matcher = field(default_factory=CodeMatcher)
     registration: RegistrationMethod = field(default_factory=DescentRegistration)
     pose_graph: PoseGraphConfig = field(default_factory=PoseGraphConfig)

@@ -24,7 +24,6 @@ from more2_jax.storage.scene_folder import load_scene
 from more2_jax.tracking.objects import new_object, seen_again
 from more2_jax.types import Instance, Observation, Scan
 
-pytestmark = pytest.mark.quickly
 PAPER = preset("paper")
 SHORT = dataclasses.replace(
     PAPER,

@@ -12,6 +12,8 @@ from more2_jax.network import prior as network_prior
 from more2_jax.registration import search, surface
 from more2_jax.scene import add_scan, reconstruct, run_scenes, start_scene
 
+pytestmark = [pytest.mark.optimized, pytest.mark.no_cover]
+
 SCENES = (
     # Two stay or move, one comes; one object alone; none of the second scan is known.
     (scan("a", {0: (0.0, 0.0), 1: (0.3, 3.0)}), scan("b", {0: (0.5, 0.3), 1: (0.3, 3.0), 2: (0.0, 6.0)})),

@@ -22,6 +22,8 @@ from more2_jax.tracking.changes import moved_probability
 from more2_jax.tracking.objects import points_of
 from more2_jax.types import Instance, Mesh, Scan
 
+pytestmark = pytest.mark.optimized  # scenes run for longer than their programs compile
+
 VISITS = (
     {0: (0.0, 0.0), 1: (0.3, 3.0)},
     {0: (0.0, 0.0), 2: (0.0, 6.0)},

@@ -11,7 +11,6 @@ import jax.numpy as jnp
 import jaxlie
 import numpy as np
 import pytest
-from compiling import quick_jit
 
 import more2_jax as m2
 from more2_jax.config import (
@@ -27,6 +26,8 @@ from more2_jax.network.prior import encode_ordered
 from more2_jax.refinement.joint import Observations
 from more2_jax.refinement.pose_graph import OrientedObservations, optimize_pose_graphs
 
+pytestmark = pytest.mark.no_cover
+
 ROWS, REAL, OBJECTS, SEEN = 256, 200, 3, 2
 MASK = np.arange(ROWS) < np.full((OBJECTS, 1), REAL)  # closed over
 DESCENT = DescentRegistration(points=32, sdf_points=32, steps=2, icp_steps=2)
@@ -36,11 +37,10 @@ SURFACE = SurfaceRegistration(
     search=SEARCH, points=32, steps=2, field_points=32, polish_points=32, polish_steps=1
 )
 JOINT = JointConfig(steps=2, points=32)
+# Traced as they are and in reverse mode they are for their products' precision, below.
 TRANSFORMATIONS = {
-    "jit": jax.jit,
-    "vmap": lambda f: lambda x: jax.vmap(f)(jnp.stack([x, x])),
-    "grad": lambda f: jax.jit(jax.grad(f)),
-    "jvp": lambda f: lambda x: jax.jvp(f, (x,), (x,)),
+    "vmap": lambda f: jax.jit(lambda x: jax.vmap(f)(jnp.stack([x, x]))),
+    "jvp": lambda f: jax.jit(lambda x: jax.jvp(f, (x,), (x,))),
 }
 
 
@@ -61,7 +61,7 @@ def number(tree) -> jax.Array:
 
 @pytest.fixture(scope="module")
 def code(tiny_prior):
-    return quick_jit(m2.encode)(tiny_prior, cloud_of(jnp.asarray(points())))
+    return jax.jit(m2.encode)(tiny_prior, cloud_of(jnp.asarray(points())))
 
 
 def pairs_of(x, code):
@@ -122,18 +122,17 @@ def test_public_functions_trace(tiny_prior, code, name, transformation):
     assert jax.tree.leaves(jax.eval_shape(f, jnp.asarray(points())))
 
 
-@pytest.mark.quickly
 def test_jitted_registration_takes_its_settings_as_they_are(tiny_prior, code):
     pairs = pairs_of(jnp.asarray(points()), code)
     plain = m2.register(tiny_prior, pairs, DESCENT)
     for jitted in (
-        quick_jit(m2.register)(tiny_prior, pairs, DESCENT),
-        quick_jit(m2.register, static_argnames="motion")(tiny_prior, pairs, DESCENT, motion="upright"),
+        jax.jit(m2.register)(tiny_prior, pairs, DESCENT),
+        jax.jit(m2.register, static_argnames="motion")(tiny_prior, pairs, DESCENT, motion="upright"),
     ):
         np.testing.assert_allclose(jitted.loss, plain.loss, rtol=1e-4)
     observations = observations_of(jnp.asarray(points()), code)
     joint = m2.fit_jointly(tiny_prior, observations, JOINT)
-    again = quick_jit(m2.fit_jointly)(tiny_prior, observations, JOINT)
+    again = jax.jit(m2.fit_jointly)(tiny_prior, observations, JOINT)
     np.testing.assert_allclose(again.loss, joint.loss, rtol=1e-4)
 
 
@@ -169,7 +168,7 @@ WITHOUT_PRODUCTS = {"chamfer_distance"}
 @pytest.mark.parametrize("name", list(PROGRAMS))
 def test_no_product_is_left_to_the_default_precision(tiny_prior, code, name):
     f, x = of_points(name, tiny_prior, code), jnp.asarray(points())
-    for g in (f, jax.grad(f)):
+    for g in (jax.jit(f), jax.jit(jax.grad(f))):
         left, count = coarse(g, x)
         assert left == 0
         assert count > 0 or name in WITHOUT_PRODUCTS

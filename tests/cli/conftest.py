@@ -2,21 +2,19 @@
 
 from pathlib import Path
 
-import jax
 import pytest
-from command_line import TINY
 from factories import living_scene
 
 from more2_jax.config import preset
-from more2_jax.network.prior import init_prior, save_prior
+from more2_jax.network.prior import save_prior
 from more2_jax.report import report_html
 from more2_jax.storage.scene_folder import save_scene
 
 
 @pytest.fixture(scope="session")
-def tiny(tmp_path_factory) -> Path:
+def tiny(tmp_path_factory, tiny_prior) -> Path:
     path = tmp_path_factory.mktemp("weights") / "tiny.npz"
-    save_prior(init_prior(TINY, jax.random.key(0), "tiny"), path)
+    save_prior(tiny_prior, path)
     return path
 
 

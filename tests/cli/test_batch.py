@@ -19,6 +19,8 @@ from more2_jax.cli.options import Reading
 from more2_jax.storage.scene_folder import load_scene
 from more2_jax.workers.dealing import Desk
 
+pytestmark = pytest.mark.optimized  # scenes run for longer than their programs compile
+
 
 class Inline:
     """A team that works in this process, where programs are compiled already."""

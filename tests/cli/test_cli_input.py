@@ -16,6 +16,8 @@ from more2_jax.cli.settings import scene_config
 from more2_jax.config import preset
 from more2_jax.storage.scene_folder import load_scene, save_scene
 
+pytestmark = pytest.mark.optimized  # scenes run for longer than their programs compile
+
 
 def bad_scan(folder: Path, kind: str) -> Path:
     points, ids = boxes()

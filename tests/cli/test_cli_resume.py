@@ -6,7 +6,6 @@ import os
 import signal
 import subprocess
 import sys
-from importlib.metadata import version
 from pathlib import Path
 
 import pytest
@@ -14,12 +13,11 @@ from command_line import FEW_STEPS, boxes, heed_interrupts, refused, run_quickly
 
 from more2_jax.cli import living_scenes as building
 from more2_jax.cli.main import main
-from more2_jax.cli.session import EMITTERS, KNOWS_EMITTERS
 from more2_jax.network.prior import load_prior, save_prior
 from more2_jax.storage.scene_folder import load_scene
 
-# As in this process, whose JAX started before a command could set its flag: what rounds otherwise is no other end.
-FLAGS = {"XLA_FLAGS": f"--{EMITTERS}=true" if version("jaxlib").startswith(KNOWS_EMITTERS) else ""}
+pytestmark = pytest.mark.optimized  # scenes run for longer than their programs compile
+
 POSIX = pytest.mark.skipif(os.name != "posix", reason="sends signals")
 # Stops at a named place, says so, and waits there to be sent a signal.
 STOPPING = """
@@ -63,7 +61,7 @@ def stopped(argv: list[str], place: str, nth: int, sent: signal.Signals) -> tupl
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
-        env=os.environ | FLAGS | {"JAX_DEFAULT_MATMUL_PRECISION": "highest"},
+        env=os.environ | {"JAX_DEFAULT_MATMUL_PRECISION": "highest"},
         preexec_fn=heed_interrupts,
     )
     with process:

@@ -18,6 +18,8 @@ from more2_jax.config import preset
 from more2_jax.report import report_html, upright_text
 from more2_jax.storage.scene_folder import load_scene, save_scene
 
+pytestmark = pytest.mark.optimized  # scenes run for longer than their programs compile
+
 
 def test_run_then_add(tmp_path, tiny, capsys):
     kinds = (("a", 0, 2), ("b", 0.3, 2), ("c", 0, 3))

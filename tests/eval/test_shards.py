@@ -171,7 +171,6 @@ def test_hosts_are_told_what_took_the_place_of_distributed(monkeypatch):
         run_program(matching.main)
 
 
-@pytest.mark.quickly
 def test_a_real_program_in_shards(options, tmp_path):
     """Everything but measured seconds is the same to the bit."""
     o = matching.Settings(**{**dataclasses.asdict(options), "preset": "paper", "batch": 4})

@@ -5,7 +5,6 @@ import dataclasses
 import jax
 import numpy as np
 import pytest
-from compiling import quick_jit
 from places import ROOT
 
 from eval.performance.stopwatch import Seconds, timed
@@ -27,7 +26,7 @@ def small():
 
 def test_plain_layers_say_what_ours_say(small):
     points, queries, _ = clouds_and_queries(2, 64, 16)
-    coded, asked_of = (quick_jit(f, static_argnames="plain") for f in (outputs, distances))
+    coded, asked_of = (jax.jit(f, static_argnames="plain") for f in (outputs, distances))
     for cloud, asked in zip(points, queries, strict=True):
         ours, plain = (coded(small, cloud, plain=p) for p in (False, True))
         for a, b in zip(ours, plain, strict=True):

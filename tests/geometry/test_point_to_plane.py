@@ -24,8 +24,6 @@ from more2_jax.geometry.points import transformed
 from more2_jax.registration.pose_costs import misfit, turned_apart
 from more2_jax.registration.surface import TURNED_DEG, choose, nearly_as_good
 
-pytestmark = pytest.mark.quickly
-
 POINTS = 256
 
 

@@ -27,8 +27,6 @@ from more2_jax.geometry.points import (
 )
 from more2_jax.types import Sampled
 
-pytestmark = pytest.mark.quickly
-
 RNG = np.random.default_rng(0)
 CLOUD = RNG.normal(size=(50, 3)).astype(np.float32)
 PLANE, LINE = CLOUD * [1, 1, 0], CLOUD * [1, 0, 0]

@@ -7,7 +7,6 @@ import jax.numpy as jnp
 import jaxlie
 import numpy as np
 import pytest
-from compiling import quick_jit
 from scipy.optimize import linear_sum_assignment
 from scipy.special import expit
 
@@ -41,8 +40,6 @@ from more2_jax.network.embedding_batch import embed
 from more2_jax.network.prior import load_prior
 from more2_jax.registration.pose_costs import field_cost, off_field, off_fields
 from more2_jax.types import ObservedObject
-
-pytestmark = pytest.mark.quickly
 
 FIELDS = (
     *("off_source", "off_target", "apart_source", "apart_target"),
@@ -165,17 +162,17 @@ def test_in_any_orientation_the_evidence_is_that_of_the_best_pose(tiny_prior):
         jax.tree.map(lambda x: jnp.asarray(x[0]), dataclasses.replace(side, origin=None))
         for side in (pair.source, pair.target)
     ]
-    sample = quick_jit(lambda p, m: coarsened(whole_surface(p, m), 128, 256, 8).sampled)
+    sample = jax.jit(lambda p, m: coarsened(whole_surface(p, m), 128, 256, 8).sampled)
     sampled = [sample(x.cloud.points, x.cloud.mask) for x in sides]
     codes = [x.code for x in sides]
     T = jax.tree.map(lambda x: x[0], aligned.found.poses)
-    off = quick_jit(off_fields)(tiny_prior, T, tuple(sampled), tuple(codes))
+    off = jax.jit(off_fields)(tiny_prior, T, tuple(sampled), tuple(codes))
     np.testing.assert_allclose([found.off_source[0], found.off_target[0]], off[0], atol=1e-3)
     cost = jnp.asarray(aligned.found.cost[0])
     cost += field_cost(cost, off.mean(axis=1), search.field_weight)
     assert float(cost[0]) <= float(cost.min()) + 1e-2
     own = [
-        quick_jit(off_field)(tiny_prior, jaxlie.SE3.identity(), c, e)
+        jax.jit(off_field)(tiny_prior, jaxlie.SE3.identity(), c, e)
         for c, e in zip(sampled, codes, strict=True)
     ]
     np.testing.assert_allclose(found.off_own[0], max(own), atol=1e-3)

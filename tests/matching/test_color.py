@@ -23,6 +23,8 @@ from more2_jax.tracking.objects import new_object, seen_again
 from more2_jax.tracking.relocalize import known_object
 from more2_jax.types import Color, Instance, ObservedObject, Scan
 
+pytestmark = pytest.mark.optimized  # scenes run for longer than their programs compile
+
 RED, BLUE, GRAY = (190, 60, 50), (60, 80, 170), (128, 128, 128)
 HERE, THERE = 0.0, 3.0
 

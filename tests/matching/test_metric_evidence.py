@@ -17,8 +17,6 @@ from more2_jax.registration.pair_batch import local_batch
 from more2_jax.registration.search import alignable
 from more2_jax.types import ObservedObject
 
-pytestmark = pytest.mark.quickly
-
 SEARCH = SurfaceSearch(points=64, dense=128, cells=8, turns=4, steps=2)
 UP = np.array([[0.0, -1, 0, 0.3], [1, 0, 0, 0.2], [0, 0, 1, 0.05], [0, 0, 0, 1]])
 

@@ -8,7 +8,6 @@ import jaxlie
 import numpy as np
 import pieces
 import pytest
-from compiling import quick_jit
 from scipy.spatial.transform import Rotation
 
 from more2_jax.config import preset
@@ -19,10 +18,8 @@ from more2_jax.registration import pose_costs
 from more2_jax.registration.pose_costs import ABOUT_AS_WELL, OFF_FIELD, field_cost
 
 POINTS, COUNT = 512, 64
-off_both_ways = quick_jit(pose_costs.off_fields)
-surface_of = quick_jit(whole_surface)
-
-pytestmark = pytest.mark.quickly
+off_both_ways = jax.jit(pose_costs.off_fields)
+surface_of = jax.jit(whole_surface)
 
 
 @pytest.fixture(scope="module")

@@ -6,7 +6,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from compiling import quick_jit
 from places import ROOT
 from scipy.spatial.transform import Rotation
 
@@ -88,7 +87,7 @@ def test_similarity_equivariance_in_float64(tiny_prior):
     cloud = furniture(5, count=128)
     with jax.enable_x64(True):
         prior = jax.tree.map(lambda x: x.astype(jnp.float64), tiny_prior)
-        each = quick_jit(jax.vmap(lambda points: encode_one(prior, points, jnp.ones(128, bool))))
+        each = jax.jit(jax.vmap(lambda points: encode_one(prior, points, jnp.ones(128, bool))))
         before, after = (
             jax.tree.map(
                 lambda x, k=k: np.asarray(x[k]), each(np.stack([cloud, scale * cloud @ turn.T + shift]))
@@ -170,7 +169,7 @@ def test_degenerate_clouds_have_finite_codes_and_gradients(prior):
         e = encode_one(prior, points, mask)
         return e.inv.sum() + e.eqv.sum() + e.scale + e.center.sum(), e
 
-    each = quick_jit(jax.vmap(jax.grad(total, has_aux=True), in_axes=(0, 0, None)))
+    each = jax.jit(jax.vmap(jax.grad(total, has_aux=True), in_axes=(0, 0, None)))
     gradients, codes = each(cloud.points, cloud.mask, prior)
     finite = jax.tree.map(lambda x: np.isfinite(x).reshape(len(x), -1).all(axis=1), (gradients, codes))
     for ok in jax.tree.leaves(finite):
@@ -186,7 +185,7 @@ def test_gradient_agrees_with_finite_differences(tiny_prior):
         points, mask = furniture(4, count=100), np.ones(100, bool)
         along, step = np.random.default_rng(0).normal(size=(100, 3)), 1e-7
 
-        @quick_jit
+        @jax.jit
         @jax.value_and_grad
         def total(points: jax.Array, mask: jax.Array, prior: Prior) -> jax.Array:
             e = encode_one(prior, points, mask)

@@ -8,12 +8,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from compiling import quick_jit
 
 from more2_jax.network.prior import encode, sdf
 from more2_jax.types import Embedding, PointCloud
 
-pytestmark = pytest.mark.quickly
 REAL = 90, 110  # points of the two clouds; the rest of the rows is padding
 ROWS, QUERIES, STEP = 128, 20, 1e-8
 MASK = np.arange(ROWS) < np.array(REAL)[:, None]
@@ -66,7 +64,7 @@ def of_shift(shift: jax.Array, prior) -> dict[str, jax.Array]:
     return outputs(moved(shift), prior)
 
 
-value_of_shift, slope_of_shift = quick_jit(of_shift), quick_jit(jax.jacrev(of_shift))
+value_of_shift, slope_of_shift = jax.jit(of_shift), jax.jit(jax.jacrev(of_shift))
 
 
 def differences(function, at: np.ndarray) -> dict[str, np.ndarray]:
@@ -88,7 +86,7 @@ def assert_close(ours: dict, numeric: dict, tolerance: float) -> None:
 # --- derivatives by the points ----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("slope", [quick_jit(jax.jacfwd(of_shift)), slope_of_shift], ids=["jacfwd", "jacrev"])
+@pytest.mark.parametrize("slope", [jax.jit(jax.jacfwd(of_shift)), slope_of_shift], ids=["jacfwd", "jacrev"])
 def test_both_modes_agree_with_central_differences(prior64, slope):
     at = np.zeros(3)
     assert_close(slope(at, prior64), differences(lambda x: value_of_shift(x, prior64), at), 1e-6)
@@ -96,7 +94,7 @@ def test_both_modes_agree_with_central_differences(prior64, slope):
 
 def test_forward_over_reverse_agrees_with_differences_of_gradients(prior64):
     at = np.zeros(3)
-    found = quick_jit(jax.hessian(of_shift))(at, prior64)
+    found = jax.jit(jax.hessian(of_shift))(at, prior64)
     assert_close(found, differences(lambda x: slope_of_shift(x, prior64), at), 1e-6)
     for name in OUTPUTS:
         np.testing.assert_allclose(found[name], found[name].T, rtol=0, atol=1e-9 * np.abs(found[name]).max())
@@ -123,9 +121,9 @@ def test_a_change_of_all_weights_agrees_with_central_differences(prior64):
         return outputs(points, jax.tree.map(lambda w, d: w + share[0] * d, prior64, along))
 
     at = np.zeros(1)
-    numeric = differences(quick_jit(on_the_way), at)
+    numeric = differences(jax.jit(on_the_way), at)
     for mode in (jax.jacfwd, jax.jacrev):
-        assert_close(quick_jit(mode(on_the_way))(at), numeric, 1e-6)
+        assert_close(jax.jit(mode(on_the_way))(at), numeric, 1e-6)
 
 
 # --- doors ------------------------------------------------------------------------------------------------------

@@ -9,7 +9,6 @@ import jax.numpy as jnp
 import jaxlie
 import numpy as np
 import pytest
-from compiling import quick_jit
 from places import ROOT
 
 from more2_jax.config import load_config, preset
@@ -30,9 +29,8 @@ from more2_jax.scene import start_scene
 from more2_jax.types import Anchors, Instance, Scan
 from train.run.settings import TrainingRun
 
-pytestmark = pytest.mark.quickly
 CHANNELS, BANDWIDTHS, INPUTS = 4, (0.1, 0.3), 6
-encoded, distance = quick_jit(encode_one), quick_jit(sdf_one)
+encoded, distance = jax.jit(encode_one), jax.jit(sdf_one)
 
 
 def random_anchors(count: int, seed: int = 0) -> Anchors:
@@ -179,7 +177,7 @@ def test_gradients_are_finite_with_few_real_points(prior, cloud):
         weights = dataclasses.replace(prior, params=params)
         return jnp.abs(sdf_one(weights, encode_one(weights, points, mask), points[:30])).sum()
 
-    gradient = quick_jit(jax.grad(total, argnums=(0, 1)))(prior.params, cloud, mask)
+    gradient = jax.jit(jax.grad(total, argnums=(0, 1)))(prior.params, cloud, mask)
     gradient = jax.device_get(gradient)
     assert all(np.isfinite(g).all() for g in jax.tree.leaves(gradient))
     assert float(np.abs(gradient[0]["decoder"]["local_1"]["slope"]).max()) > 0
@@ -188,7 +186,7 @@ def test_gradients_are_finite_with_few_real_points(prior, cloud):
 # --- normals ------------------------------------------------------------------------------------------------
 
 
-placed, field = quick_jit(encode_one), quick_jit(sdf_one)
+placed, field = jax.jit(encode_one), jax.jit(sdf_one)
 
 
 def weights_of(q, position, bandwidth=0.1):
@@ -320,7 +318,7 @@ def test_gradients_with_normals_are_finite_where_few_are_known(seeing, cloud):
         weights = dataclasses.replace(seeing, params=params)
         return jnp.abs(sdf_one(weights, encode_one(weights, points, mask, normals), points[:30])).sum()
 
-    gradient = quick_jit(jax.grad(total, argnums=(0, 1, 3)))(seeing.params, cloud, mask, normals)
+    gradient = jax.jit(jax.grad(total, argnums=(0, 1, 3)))(seeing.params, cloud, mask, normals)
     gradient = jax.device_get(gradient)
     assert all(np.isfinite(g).all() for g in jax.tree.leaves(gradient))
     assert np.abs(gradient[0]["decoder"]["local_1"]["log_near_plane"]) > 0

@@ -8,7 +8,6 @@ import jaxlie
 import numpy as np
 import pieces
 import pytest
-from compiling import quick_jit
 from scipy.spatial.transform import Rotation
 
 from more2_jax.config import JointConfig
@@ -18,7 +17,6 @@ from more2_jax.network.prior import encode
 from more2_jax.refinement import joint
 from more2_jax.refinement.joint import Observations, code_drift, fit_jointly, surface_loss
 
-pytestmark = pytest.mark.quickly
 POINTS, OBJECTS, SEEN = 128, 3, 4  # every object seen three times, and one row of padding
 CONFIG = JointConfig(
     points=POINTS,
@@ -86,7 +84,7 @@ def test_the_loss_never_ends_above_its_start(fit, unmoved):
 @pytest.mark.parametrize("start", ["best", "accumulated"])
 def test_no_step_is_the_loss_of_the_start_by_definition(tiny_prior, seen, start):
     config = dataclasses.replace(CONFIG, steps=0, start=start)
-    fit, loss_of = fit_jointly(tiny_prior, seen, config), quick_jit(surface_loss)
+    fit, loss_of = fit_jointly(tiny_prior, seen, config), jax.jit(surface_loss)
     for n in range(OBJECTS):
         one = joint.subsample(jax.tree.map(lambda x, n=n: x[n], seen), POINTS)
         radius = joint.cloud_radius(one.points[0], one.mask[0])
@@ -252,12 +250,12 @@ def test_derivatives_in_both_modes_are_those_of_central_differences(in_float64):
         """`outcome` as far as t along three random directions."""
         return outcome(prior, observations, config, t[0] * points, t[1] * pose, t[2] * code)
 
-    value, zero, step = quick_jit(along), jnp.zeros(3), 1e-6
+    value, zero, step = jax.jit(along), jnp.zeros(3), 1e-6
     differences = [(value(step * e) - value(-step * e)) / (2 * step) for e in np.eye(3)]
     assert np.abs(differences).min() > 1e-3
-    np.testing.assert_allclose(quick_jit(jax.grad(along))(zero), differences, rtol=1e-5)
-    np.testing.assert_allclose(quick_jit(jax.jacfwd(along))(zero), differences, rtol=1e-5)
-    one = quick_jit(lambda e: jax.jvp(along, (zero,), (e,))[1])(np.ones(3))
+    np.testing.assert_allclose(jax.jit(jax.grad(along))(zero), differences, rtol=1e-5)
+    np.testing.assert_allclose(jax.jit(jax.jacfwd(along))(zero), differences, rtol=1e-5)
+    one = jax.jit(lambda e: jax.jvp(along, (zero,), (e,))[1])(np.ones(3))
     np.testing.assert_allclose(one, np.sum(differences), rtol=1e-5)
 
 

@@ -25,6 +25,8 @@ from more2_jax.refinement.pose_graph_of_objects import (
 )
 from more2_jax.types import AccumulatedObject
 
+pytestmark = pytest.mark.optimized  # poses are refined for longer than that compiles
+
 CONFIG = preset("robust", upright=True)
 PIECE = without_symmetry()[0]
 SHIFTS = np.array([[0.0, 0, 0], [2.0, 1, 0], [-1.0, 3, 0]])

@@ -127,8 +127,12 @@ def test_what_stands_in_masked_rows_changes_nothing(prior, clouds, junk):
 def test_flat_straight_and_single_points_give_finite_poses(prior, clouds):
     cloud = clouds[0]
     odd = [cloud * [1, 1, 0], cloud * [1, 0, 0], cloud[:1], np.repeat(cloud[:2], 10, axis=0)]
-    pairs = pairs_of(prior, odd, odd)
-    for motion in ("free", "upright"):
+    # Any way up from two given starts, upright from its own.
+    given = np.broadcast_to(
+        np.stack([np.eye(4), pieces.pose(Rotation.identity(), [0.1, 0, 0])]), (4, 2, 4, 4)
+    )
+    for motion, candidates in (("free", given), ("upright", None)):
+        pairs = pairs_of(prior, odd, odd, candidates)
         result = register(prior, pairs, FIELD, motion)
         assert np.isfinite(result.T_target_source.as_matrix()).all()
         assert bool(jnp.isfinite(result.rms_m).all()) and bool(jnp.isfinite(result.loss).all())

@@ -9,7 +9,6 @@ import jaxlie
 import numpy as np
 import pieces
 import pytest
-from compiling import quick_jit
 
 from more2_jax.config import DescentRegistration, FieldRegistration, SurfaceRegistration, SurfaceSearch
 from more2_jax.network.prior import encode
@@ -17,7 +16,6 @@ from more2_jax.registration.pair_batch import batch_of, pair_up
 from more2_jax.registration.register_pairs import register
 from more2_jax.types import PointCloud
 
-pytestmark = pytest.mark.quickly
 COUNT = 64
 MASK = np.ones((2, COUNT), bool)  # closed over by what is compiled
 DESCENT = DescentRegistration(points=32, sdf_points=32, steps=5, icp_steps=2)
@@ -81,7 +79,7 @@ def test_gradient_through_encoder_kabsch_and_refinement_agrees_with_finite_diffe
             return value, gradient, jax.jvp(lambda x: loss(x, target, prior, given), (x,), (way,))[1]
 
         for given in (None, codes):
-            slopes_of = quick_jit(lambda x, way, given=given: slopes(x, way, given))
+            slopes_of = jax.jit(lambda x, way, given=given: slopes(x, way, given))
             for _ in range(4):
                 way, eps = jnp.asarray(rng.normal(size=source.shape)), 1e-6
                 after, before = (slopes_of(source + s * way, way)[0] for s in (eps, -eps))
@@ -106,7 +104,7 @@ def test_gradient_through_steps_on_the_fields_agrees_with_finite_differences(tin
         def of_one(x):
             return loss(x, target, prior, codes)
 
-        @quick_jit
+        @jax.jit
         def slopes(x, way):
             value, gradient = jax.value_and_grad(of_one)(x)
             return value, jnp.vdot(gradient, way), jax.jvp(of_one, (x,), (way,))[1]
@@ -126,7 +124,8 @@ METHODS = {
     "surface without candidates": (SURFACE, None),
 }
 CASES = list(itertools.product(METHODS, ["source", "target"]))
-COMPILED = [CASES[k] for k in (0, 3, 4)]  # both clouds and every method; the others are traced, and slow
+# The longest way; descent from either cloud is compiled above, and what is left is traced, and slow.
+COMPILED = [CASES[4]]
 
 
 def slopes_of_one(prior, clouds, method, moved):
@@ -153,7 +152,7 @@ def test_both_modes_agree_whichever_cloud_is_traced(tiny_prior, clouds, method, 
     """The other cloud and both codes are constants of the program."""
     of_one, cloud, slopes = slopes_of_one(tiny_prior, clouds, method, moved)
     way = jnp.asarray(np.random.default_rng(1).normal(size=cloud.shape), jnp.float32)
-    value, forward, gradient = quick_jit(slopes)(cloud, way)
+    value, forward, gradient = jax.jit(slopes)(cloud, way)
     assert bool(jnp.isfinite(gradient).all()) and float(jnp.abs(gradient).max()) > 1e-4
     assert float(forward) == pytest.approx(float(jnp.vdot(gradient, way)), rel=2e-3)
     assert float(value) == pytest.approx(float(of_one(cloud)), rel=1e-3)
@@ -169,5 +168,5 @@ def test_both_modes_take_either_cloud(tiny_prior, clouds, method, moved):
 
 def test_gradients_through_the_encoder_reach_surface_registration(tiny_prior, clouds):
     source, target = (jnp.asarray(x, jnp.float32) for x in clouds)
-    gradient = quick_jit(jax.grad(loss_with(SURFACE, start(10.0))))(source, target, tiny_prior)
+    gradient = jax.jit(jax.grad(loss_with(SURFACE, start(10.0))))(source, target, tiny_prior)
     assert bool(jnp.isfinite(gradient).all()) and float(jnp.abs(gradient).max()) > 1e-4

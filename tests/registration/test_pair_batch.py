@@ -27,7 +27,6 @@ from more2_jax.registration.pair_batch import (
 from more2_jax.registration.register_pairs import register
 from more2_jax.types import ObservedObject
 
-pytestmark = pytest.mark.quickly
 KILOMETER = np.array([1000.0, -2000.0, 5.0])
 QUICK = DescentRegistration(points=32, sdf_points=32, steps=2, icp_steps=2)
 

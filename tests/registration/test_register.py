@@ -139,6 +139,7 @@ def test_a_symmetric_object_that_stayed_is_said_to_have_stayed(tiny_prior):
     np.testing.assert_allclose(found[0], np.eye(4), atol=1e-6)
 
 
+@pytest.mark.optimized  # a line turned round differs from itself by rounding
 def test_flat_straight_and_single_points_give_finite_poses(tiny_prior):
     cloud = furniture()[0]
     degenerate = [cloud * [1, 1, 0], cloud * [1, 0, 0], cloud[:1], np.repeat(cloud[:2], 10, axis=0)]
@@ -167,7 +168,6 @@ def observed(prior, clouds):
     return [ObservedObject(points=p, embedding=e) for p, e in zip(clouds, embed(prior, clouds), strict=True)]
 
 
-@pytest.mark.quickly
 def test_the_loss_returned_is_that_of_the_pose_returned(tiny_prior, still):
     result = register(tiny_prior, still, PAPER)
 
@@ -182,7 +182,6 @@ def test_the_loss_returned_is_that_of_the_pose_returned(tiny_prior, still):
     np.testing.assert_allclose(result.loss, expected, rtol=1e-4)
 
 
-@pytest.mark.quickly
 def test_of_several_candidates_the_one_that_ends_with_the_lowest_residual_is_returned(tiny_prior, still):
     pair = jax.tree.map(lambda x: x[:1], still.local())
     turns = jax.vmap(jaxlie.SO3.from_z_radians)(jnp.deg2rad(jnp.array([180.0, 2.0, 90.0])))
@@ -224,7 +223,6 @@ def test_records_of_another_encoder_are_refused_where_the_decoder_would_be_asked
         sdf(load_prior("small"), other, np.zeros((1, 1, 3)))
 
 
-@pytest.mark.quickly
 def test_records_of_another_encoder_are_registered_where_the_prior_is_not_asked(tiny_prior):
     clouds, rng = furniture(), np.random.default_rng(1)
     poses = [pieces.random_pose(rng, upright=True) for _ in clouds]

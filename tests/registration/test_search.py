@@ -1,16 +1,14 @@
 """Which starts of a search go on after its first steps."""
 
+import jax
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
 import pytest
-from compiling import quick_jit
 from scipy.spatial.transform import Rotation
 
 from more2_jax.config import SurfaceSearch
 from more2_jax.registration.search import ROUNDS, SAME_DEG, FoundPoses, in_rounds
-
-pytestmark = pytest.mark.quickly
 
 SEARCH = SurfaceSearch(steps=6)
 
@@ -26,7 +24,7 @@ def in_rounds_of(turns_deg, cost, rounds=ROUNDS):
         moved = jaxlie.SE3(poses.wxyz_xyz.at[:, 4].add(reaches.sum()))
         return FoundPoses(poses=moved, cost=jnp.asarray(cost)[row])
 
-    found = quick_jit(lambda s: in_rounds(jaxlie.SE3(s), aligned, SEARCH, rounds))(starts)
+    found = jax.jit(lambda s: in_rounds(jaxlie.SE3(s), aligned, SEARCH, rounds))(starts)
     rows = np.asarray(found.poses.wxyz_xyz[:, 6]).astype(int)
     np.testing.assert_array_equal(found.cost, np.asarray(cost, np.float32)[rows])
     return rows.tolist(), np.asarray(found.poses.wxyz_xyz[:, 4])

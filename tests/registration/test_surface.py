@@ -1,25 +1,22 @@
 """The prior is asked only where it can decide: what is chosen, and what competes, are as if it were always asked."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
-from compiling import quick_jit
 
 from more2_jax.registration.pose_costs import ABOUT_AS_WELL, field_cost
 from more2_jax.registration.surface import as_good_as, asked_in_order, choose, nearly_as_good
 
-pytestmark = pytest.mark.quickly
-
 WEIGHT = 2.0
 
 
-@quick_jit
+@jax.jit
 def decided(costs, doubt):
     best = choose(costs, True, doubt)
     return best, nearly_as_good(costs + doubt, best)
 
 
-asked = quick_jit(lambda costs, off: asked_in_order(lambda k: off[k], costs, WEIGHT))
+asked = jax.jit(lambda costs, off: asked_in_order(lambda k: off[k], costs, WEIGHT))
 
 
 def test_the_choice_and_what_competes_are_those_of_all_answers():

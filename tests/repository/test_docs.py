@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import re
-from functools import partial
 
-import jax
 import numpy as np
 import pytest
-from compiling import QUICKLY
 from places import ROOT
 
 
@@ -17,15 +14,9 @@ def snippet(page: str) -> str:
     return "\n".join(re.findall(r"```python\n(.*?)```", (ROOT / page).read_text(), re.DOTALL))
 
 
-def jit_quickly(function, of: str, jit, **options):
-    """What is jitted by module `of` compiles quickly, as it runs once; anything else as ever."""
-    return jit(function, **options, **({"compiler_options": QUICKLY} if function.__module__ == of else {}))
-
-
 @pytest.mark.slow
-def test_the_gradient_example_gives_a_finite_gradient(monkeypatch):
+def test_the_gradient_example_gives_a_finite_gradient():
     names: dict[str, object] = {"__name__": "snippet"}
-    monkeypatch.setattr(jax, "jit", partial(jit_quickly, of=str(names["__name__"]), jit=jax.jit))
     exec(snippet("docs/guides/gradients.md"), names)
     gradient = np.asarray(names["gradient"])
     assert np.isfinite(gradient).all()

@@ -66,6 +66,7 @@ WITH_PYTHON = [p for p in PAGES if p.name not in RUN_ELSEWHERE and "python" in d
 README = ROOT / "README.md"
 
 
+@pytest.mark.no_cover
 @pytest.mark.parametrize("page", WITH_PYTHON, ids=named)
 def test_the_python_of_a_page_runs_and_prints_what_it_says(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
@@ -188,14 +189,23 @@ def test_the_readme_is_short_and_shows_picture_and_chart():
     assert {"docs/pictures/before_after.png", "docs/pictures/peers.png"} <= {t for t, _ in LINK.findall(text)}
 
 
-def test_the_site_builds_strictly_and_loads_nothing_from_elsewhere(tmp_path):
+@pytest.fixture(scope="module")
+def site(tmp_path_factory) -> Path:
+    """The site, built strictly: by `.ci/run`, which names its folder, or here."""
+    if built := os.environ.get("BUILT_SITE"):
+        return Path(built)
     pytest.importorskip("mkdocs", reason="needs the extra `docs`")
-    build = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", str(tmp_path)]
+    folder = tmp_path_factory.mktemp("site")
+    build = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", str(folder)]
     subprocess.run(build, cwd=ROOT, check=True, env=os.environ | {"NO_MKDOCS_2_WARNING": "1"}, timeout=120)
-    pages = list(tmp_path.rglob("*.html"))
+    return folder
+
+
+def test_the_site_builds_and_loads_nothing_from_elsewhere(site):
+    pages = list(site.rglob("*.html"))
     assert len(pages) >= len(PAGES)
     for page in pages:
         html = page.read_text(encoding="utf-8")
         loaded = re.findall(r"<(?:script|link|img|iframe)\b[^>]*?(?:src|href)=\"(https?:[^\"]+)\"", html)
         assert loaded == [], page.name
-    assert "add_scan" in (tmp_path / "reference" / "python.html").read_text(encoding="utf-8")
+    assert "add_scan" in (site / "reference" / "python.html").read_text(encoding="utf-8")

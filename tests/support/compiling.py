@@ -1,30 +1,34 @@
-"""Compiling for tests that look at what a program computes and run it a few times only."""
+"""How tests compile: with little optimization, unless they are marked `optimized`."""
 
-from collections.abc import Callable, Iterator
+import os
+from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any
-from unittest.mock import patch
+from importlib.metadata import version
 
 import jax
-from jax._src import compiler  # which options programs compile with has no public door
 
-# Less optimized programs compile several times faster, run slower, and compute the same up to rounding. Where rounding
-# decides, as in laws in float32, tests use what users run: `jax.jit` as it is.
-QUICKLY = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
+LITTLE = "jax_disable_most_optimizations"  # an option of JAX
 
 
-def quick_jit(function: Callable[..., Any], **options: Any) -> Any:
-    """`jax.jit`, for a program that compiles for longer than it runs."""
-    return jax.jit(function, compiler_options=QUICKLY, **options)
+def compile_quickly() -> None:
+    """Has this process compile with little optimization; before JAX compiles anything.
+
+    Such programs compile several times faster, run slower, and compute the same up to rounding. Processes that tests
+    start compile as they do for users.
+    """
+    # XLA ends the process at flags that it does not know. The commands set this one, too: what they compile is found
+    # again by the tests that are marked, and the other way round.
+    if version("jaxlib").startswith(("0.9.", "0.10.")):
+        os.environ["XLA_FLAGS"] = "--xla_cpu_use_fusion_emitters=false"
+    jax.config.update(LITTLE, True)
 
 
 @contextmanager
-def quickly() -> Iterator[None]:
-    """Programs of the library, too, compile as by `quick_jit` meanwhile; those compiled before stay as they are."""
-    real = compiler.get_compile_options
-
-    def options(*args: Any, env_options_overrides: dict[str, Any] | None = None, **rest: Any) -> Any:
-        return real(*args, env_options_overrides=QUICKLY | (env_options_overrides or {}), **rest)
-
-    with patch.object(compiler, "get_compile_options", options):
+def optimized(much: bool = True) -> Iterator[None]:
+    """Programs compile as the commands compile them meanwhile, or not; those compiled before stay as they are."""
+    before = jax.config.values[LITTLE]
+    jax.config.update(LITTLE, not much)
+    try:
         yield
+    finally:
+        jax.config.update(LITTLE, before)

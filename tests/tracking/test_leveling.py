@@ -22,6 +22,8 @@ from more2_jax.tracking.objects import place_of, points_of
 from more2_jax.tracking.relocalize import known_object
 from more2_jax.types import Frame, LivingScene, Scan
 
+pytestmark = [pytest.mark.optimized, pytest.mark.no_cover]
+
 FIRST = {0: (0.0, 0.0), 1: (0.3, 3.0), 2: (0.0, 6.0)}
 THEN = {0: (0.0, 0.0), 1: (1.2, 4.0), 2: (0.0, 6.0)}  # kind 1 moved
 NOTHING = np.zeros((0, 3))

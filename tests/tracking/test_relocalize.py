@@ -17,6 +17,8 @@ from more2_jax.tracking import relocalize
 from more2_jax.tracking.identify import identify
 from more2_jax.types import Frame
 
+pytestmark = [pytest.mark.optimized, pytest.mark.no_cover]
+
 FIRST = {0: (0.0, 0.0), 1: (0.3, 3.0), 2: (0.0, 6.0)}
 THEN = {0: (0.0, 0.0), 1: (1.2, 4.0), 2: (0.0, 6.0)}
 ONE_PARTNER = dataclasses.replace(CONFIG, matching=dataclasses.replace(CONFIG.matching, candidates=1))

@@ -20,6 +20,8 @@ from more2_jax.tracking.scan_frame import sought_there
 from more2_jax.tracking.scan_height import Rooms, Weighed, best_vote, common_height, doubtful
 from more2_jax.types import Instance, LivingScene, ObservedObject, Scan
 
+pytestmark = pytest.mark.optimized  # scenes run for longer than their programs compile
+
 FIRST = {0: (0.0, 0.0), 1: (0.3, 3.0), 2: (0.0, 6.0)}
 THEN = {0: (0.0, 0.0), 1: (1.2, 4.0), 2: (0.0, 6.0)}  # kind 1 moved
 NOTHING = np.zeros((0, 3))

@@ -8,7 +8,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from compiling import quick_jit
 from places import ROOT
 from sphere_shards import sphere_shards
 
@@ -21,7 +20,7 @@ from train.run.start import seeing_normals, started_warm
 from train.run.state import initial_state, training_step
 from train.shards.sampling import sample_batch
 
-pytestmark = pytest.mark.quickly
+pytestmark = pytest.mark.no_cover
 
 
 @pytest.fixture(scope="module")
@@ -50,7 +49,7 @@ def seeing(prior):
 @pytest.fixture(scope="module")
 def sample(tmp_path_factory, training):
     shapes = load_mix([sphere_shards(tmp_path_factory.mktemp("shards"))], "train")[0]
-    draw = quick_jit(sample_batch, static_argnames=("config", "points"))
+    draw = jax.jit(sample_batch, static_argnames=("config", "points"))
     known = dataclasses.replace(training, normals_unknown_probability=0.0)
     return shapes, draw(jax.random.key(0), shapes, jnp.arange(2), known, points=64)
 
@@ -59,8 +58,8 @@ def test_a_decoder_that_begins_to_see_normals_says_what_it_said(prior, seeing, s
     check_shapes(seeing, "widened")
     one = jax.tree.map(lambda x: x[0, 0], sample[1])
     normals = jnp.where(one.mask[:, None], one.points, 0.0) / 0.45
-    embedding = quick_jit(encode_ordered)(prior, one.points, one.mask, normals)
-    before, after = (quick_jit(sdf_one)(p, embedding, one.queries) for p in (prior, seeing))
+    embedding = jax.jit(encode_ordered)(prior, one.points, one.mask, normals)
+    before, after = (jax.jit(sdf_one)(p, embedding, one.queries) for p in (prior, seeing))
     assert np.ptp(before) > 1e-3
     np.testing.assert_allclose(after, before, atol=1e-6)
 
@@ -80,7 +79,7 @@ def test_warm_start_takes_weights_of_a_decoder_without_normals(prior, tmp_path):
 def test_a_step_of_the_decoder_leaves_the_encoder_to_the_bit(seeing, sample, training):
     mesh, state = device_mesh(1), initial_state(seeing, training)
     before = jax.device_get(state.params)
-    step = quick_jit(training_step.__wrapped__, static_argnames=("model", "config", "mesh"))
+    step = jax.jit(training_step.__wrapped__, static_argnames=("model", "config", "mesh"))
     for _ in range(2):
         state, terms = step(state, sample[0], jnp.arange(2), model=seeing.config, config=training, mesh=mesh)
     assert set(terms) == {"sdf", "sign", "gradient"}

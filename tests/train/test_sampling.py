@@ -7,7 +7,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from compiling import quick_jit
 from scipy.optimize import linprog
 
 from train.run.settings import TrainingConfig
@@ -30,6 +29,8 @@ from train.shards.sampling import partial_cloud, sample_batch
 from train.shards.shards import Shapes
 from train.shards.view_directions import DISTANCE, HALF_FIELD, view_directions
 
+pytestmark = pytest.mark.no_cover
+
 KEYS = jax.random.split(jax.random.key(0), 200)
 CLOUD = jax.random.uniform(jax.random.key(1), (500, 3), minval=-0.45, maxval=0.45)
 CONFIG = TrainingConfig(queries=64, raw_points=200, max_views=4)
@@ -41,10 +42,10 @@ UNFLAWED = dataclasses.replace(
 
 
 def each(function, keys=KEYS):
-    return quick_jit(jax.vmap(function))(keys)
+    return jax.jit(jax.vmap(function))(keys)
 
 
-draw = quick_jit(sample_batch, static_argnames=("config", "points"))
+draw = jax.jit(sample_batch, static_argnames=("config", "points"))
 
 
 def shapes(count: int = 4) -> Shapes:
@@ -260,7 +261,7 @@ def with_normals(views):
     return views, jnp.zeros(views.shape, jnp.int8)
 
 
-@partial(quick_jit, static_argnames="config")
+@partial(jax.jit, static_argnames="config")
 def clouds(views, other, config):
     seen = with_normals(views), with_normals(other)
     return jax.vmap(lambda key: partial_cloud(key, *seen, config, 16))(KEYS)
@@ -296,7 +297,7 @@ def test_a_cloud_that_cuts_would_leave_nothing_of_stays_whole():
     def kept(key, views):
         return partial_cloud(key, with_normals(views), with_normals(views), config, 200)[2]
 
-    cut = quick_jit(jax.vmap(kept, (0, None)))
+    cut = jax.jit(jax.vmap(kept, (0, None)))
     views = shapes().views[3, :4]
     small = cut(KEYS[:20], 0.05 * views).sum(
         axis=1

@@ -3,15 +3,14 @@
 import dataclasses
 import json
 import shutil
-import subprocess
 import sys
 from itertools import combinations, pairwise
 from pathlib import Path
+from unittest.mock import patch
 
 import numpy as np
 import pytest
 import trimesh
-from places import ROOT
 
 from more2_jax.scans.read_scan import read_scan
 from train import synthesize
@@ -21,6 +20,7 @@ from train.rooms.cameras import SPARSE
 from train.rooms.regimes import FLYING, balanced, by_category, furniture, near_twin, scene_config
 from train.rooms.scene_files import GRID_M, read_scene
 from train.rooms.visits import FlyingScene, TrueObject, surface_samples
+from train.run.program import run
 
 
 def box(name: str, category: str, extents: tuple[float, float, float]) -> SourceMesh:
@@ -207,18 +207,27 @@ def test_a_scene_depends_on_seed_and_number_alone(models, tmp_path):
     assert one["digest"] == two["digest"] != other["digest"]
 
 
-def command(source: Path, out: Path, *more: str, regime: str = "changes") -> subprocess.CompletedProcess[str]:
-    line = f"-m train.synthesize --source {source} --regime {regime} --scenes 2 --scans 3 --out {out}"
-    return subprocess.run(
-        [sys.executable, *line.split(), *more], cwd=ROOT, capture_output=True, text=True, check=False
-    )
+@pytest.fixture
+def command(source, capsys):
+    """The program with a command line, in this process: its exit code and standard error."""
+
+    def started(out: Path, *more: str, regime: str = "changes") -> tuple[int, str]:
+        line = f"train.synthesize --source {source} --regime {regime} --scenes 2 --scans 3 --out {out}"
+        code = 0
+        with patch.object(sys, "argv", [*line.split(), *more]):
+            try:
+                run(synthesize.main)
+            except SystemExit as end:
+                code = int(end.code or 0)
+        return code, capsys.readouterr().err
+
+    return started
 
 
-def test_any_number_of_workers_gives_the_same_and_a_stopped_run_resumes(source, tmp_path):
-    done = command(source, tmp_path / "one", "--workers", "1")
-    assert done.returncode == 0, done.stderr
+def test_any_number_of_workers_gives_the_same_and_a_stopped_run_resumes(command, tmp_path):
+    assert command(tmp_path / "one", "--workers", "1")[0] == 0
     index = json.loads((tmp_path / "one" / "index.json").read_text())
-    assert command(source, tmp_path / "two", "--workers", "2").returncode == 0
+    assert command(tmp_path / "two", "--workers", "2")[0] == 0
     assert json.loads((tmp_path / "two" / "index.json").read_text()) == index
     # As after a kill: one scene half written, no index.
     kept = tmp_path / "one" / "scene_0000" / "scene.json"
@@ -226,14 +235,14 @@ def test_any_number_of_workers_gives_the_same_and_a_stopped_run_resumes(source, 
     shutil.move(tmp_path / "one" / "scene_0001", tmp_path / "one" / "scene_0001.partial")
     (tmp_path / "one" / "scene_0001.partial" / "scan_0.npz").unlink()
     (tmp_path / "one" / "index.json").unlink()
-    assert command(source, tmp_path / "one", "--workers", "1").returncode == 0
+    assert command(tmp_path / "one", "--workers", "1")[0] == 0
     assert json.loads((tmp_path / "one" / "index.json").read_text()) == index
     assert kept.stat().st_mtime_ns == before
     index_names = ["scene_0000", "scene_0001"]
     assert [read_scene(tmp_path / "one" / n).name for n in index_names] == index_names
     assert "License: CC0" in (tmp_path / "one" / "LICENSES.md").read_text()
-    other = command(source, tmp_path / "one", "--seed", "1")
-    assert (other.returncode, other.stderr.count("\n")) == (2, 1)
+    code, said = command(tmp_path / "one", "--seed", "1")
+    assert (code, said.count("\n")) == (2, 1)
 
 
 def test_bad_input_is_one_line(source, tmp_path):
@@ -252,10 +261,10 @@ def test_bad_input_is_one_line(source, tmp_path):
         furniture("paper", MODELS[:3], np.random.default_rng(0))
 
 
-def test_a_room_that_is_too_small_ends_in_one_line(source, tmp_path):
-    done = command(source, tmp_path / "small", "--room-m", "1", "1", "--workers", "1", regime="paper")
-    assert (done.returncode, done.stderr.count("\n")) == (2, 1)
-    assert "needed more room" in done.stderr
+def test_a_room_that_is_too_small_ends_in_one_line(command, tmp_path):
+    code, said = command(tmp_path / "small", "--room-m", "1", "1", "--workers", "1", regime="paper")
+    assert (code, said.count("\n")) == (2, 1)
+    assert "needed more room" in said
 
 
 def test_models_that_cannot_be_used_are_told_with_the_reason(tmp_path):

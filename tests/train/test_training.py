@@ -11,7 +11,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from compiling import quick_jit
 from places import ROOT
 from sphere_shards import sphere_shards
 
@@ -50,7 +49,6 @@ def run():
     return load_config(ROOT / "configs" / "tiny.yaml", TrainingRun)
 
 
-@pytest.mark.quickly
 @pytest.mark.parametrize("normals", [False, True])
 def test_a_picture_shows_what_was_seen_and_the_whole_beside_the_mesh(shards, run, normals):
     decoder = dataclasses.replace(run.model.decoder, normals=normals)
@@ -132,10 +130,10 @@ def test_a_warm_start_from_another_model_is_refused_in_one_line(run, change):
 
 
 def test_gradients_of_the_training_loss_are_finite(shards, run, tiny_prior):
-    draw = quick_jit(sample_batch, static_argnames=("config", "points"))
+    draw = jax.jit(sample_batch, static_argnames=("config", "points"))
     sample = draw(jax.random.key(0), load_mix([shards], "train")[0], jnp.arange(4), run.training, points=64)
 
-    @quick_jit
+    @jax.jit
     @jax.grad
     def loss(params, sample):
         prior = dataclasses.replace(tiny_prior, params=params)

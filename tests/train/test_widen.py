@@ -8,7 +8,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from compiling import quick_jit
 from flax.traverse_util import flatten_dict
 from places import ROOT
 
@@ -19,7 +18,8 @@ from train.run.settings import TrainingRun
 from train.tools import widen as program
 from train.tools.widen import source_layer, widen
 
-pytestmark = pytest.mark.quickly
+pytestmark = pytest.mark.no_cover
+
 NARROW = PriorConfig(
     encoder=EncoderConfig(
         widths=(8, 8, 16), code=12, neighbors=4, head_channels=8, points=32, output_scale=100.0,
@@ -119,7 +119,7 @@ def test_everything_new_is_reached_by_a_gradient():
     points, mask, queries = clouds(32)
     rng = np.random.default_rng(1)
 
-    @quick_jit
+    @jax.jit
     @jax.grad
     def gradient(params, *asked):
         found = outputs(dataclasses.replace(wide, params=params), *asked)
