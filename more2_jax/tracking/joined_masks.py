@@ -28,7 +28,7 @@ from more2_jax.tracking.regrouped import JoinedMask, Regrouped
 from more2_jax.tracking.split_masks import Balls, absorbed, joined, share_on
 from more2_jax.types import Instance, ObservedObject, Repair, SceneObject
 
-# Chosen on rooms of regimes `paper`, `sparse` and `real`, docs/developing/notebook/mask_repair.md.
+# Chosen on rooms of regimes `paper`, `sparse` and `real`, docs/developing/notebook/mask_parts.md.
 TOUCHING = 2.0  # distances between neighboring points: parts of one surface lie no farther apart
 LEAST_TOUCHING = (
     0.5  # of as many points as a line across the smaller has: that many of both lie so near the other
