@@ -8,7 +8,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from compiling import quick_jit
 from places import ROOT
 
 from more2_jax.config import load_config
@@ -18,8 +17,6 @@ from train.run.settings import TrainingRun
 from train.run.start import one_decoder, started_warm
 from train.tools import join
 from train.tools.join import joined
-
-pytestmark = pytest.mark.quickly
 
 
 @pytest.fixture(scope="module")
@@ -45,11 +42,11 @@ def embeddings(both, cloud):
     """One cloud with all normals, with some, and with none: codes and anchors are the same."""
     points, unit = cloud
     normals = (unit, jnp.zeros_like(unit).at[:40].set(unit[:40]), jnp.zeros_like(unit))
-    encode = quick_jit(encode_one)
+    encode = jax.jit(encode_one)
     return [encode(both, points, jnp.ones(len(points), bool), n) for n in normals]
 
 
-distances, side_by_side = quick_jit(sdf_one), quick_jit(jax.vmap(sdf_one, in_axes=(None, 0, None)))
+distances, side_by_side = jax.jit(sdf_one), jax.jit(jax.vmap(sdf_one, in_axes=(None, 0, None)))
 
 
 def test_each_object_is_asked_by_the_decoder_that_fits_it(both, embeddings, cloud):
@@ -77,7 +74,7 @@ def test_objects_side_by_side_are_asked_by_decoders_of_their_own(both, embedding
 
 
 def test_without_normals_anywhere_none_is_known(both, cloud):
-    embedding = quick_jit(encode_one)(both, cloud[0], jnp.ones(100, bool))
+    embedding = jax.jit(encode_one)(both, cloud[0], jnp.ones(100, bool))
     assert not knows_normals(embedding)
     assert not knows_normals(dataclasses.replace(embedding, anchors=()))
 
