@@ -37,9 +37,7 @@ MAX_LEVEL = 0.1  # canonical units: a field that is farther off at observed poin
 # caches (2,048 take 0.6 times as long as 8,192 at a time); accelerators want large products where there is much to ask.
 CHUNK = 2048
 ACCELERATOR_CHUNK = 32768
-GRADIENT_CHUNK = (
-    512  # the same of gradients on CPUs, which are asked at few points of a cloud seen by one scan
-)
+GRADIENT_CHUNK = 512  # the same of gradients on CPUs: a cloud seen by one scan asks at few points
 SURE_CELLS = 0.6  # of a field whose value is so many steps of its grid, few points change the sign
 SAMPLES = CHUNK  # points at most where the field's level, and its gradient, are asked
 

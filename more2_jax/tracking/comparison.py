@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Int
 
 from more2_jax.config import EvidenceMatcher, SceneConfig
-from more2_jax.geometry.poses import Pose
+from more2_jax.geometry.poses import Points, Pose, apply_pose
 from more2_jax.matching.assignment import NEVER
 from more2_jax.matching.calibration import even_odds
 from more2_jax.matching.candidates import AlignedPairs, align_candidates, evidence_at, odds_of
@@ -60,6 +60,14 @@ class Comparison:
         """The pose of a pair that fits best: T_scene_scan as if the object had not moved."""
         (row,) = self.aligned.rows_of([(k, i)])
         return self.aligned.T_old_new[row, self.best[row]]
+
+    def object_there(self, k: int, i: int) -> Points:
+        """An object laid onto an instance by the pose that fits best, in the scan's frame."""
+        return apply_pose(np.linalg.inv(self.best_pose(k, i)), self.old[k].points)
+
+    def instance_there(self, k: int, i: int) -> Points:
+        """An instance laid onto an object by the pose that fits best, in the scene's frame."""
+        return apply_pose(self.best_pose(k, i), self.new[i].points)
 
     @cached_property
     def best(self) -> Int[np.ndarray, " p"]:

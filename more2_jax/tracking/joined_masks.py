@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import KDTree
 
-from more2_jax.geometry.poses import Points, apply_pose
+from more2_jax.geometry.poses import Points
 from more2_jax.geometry.transform import transform
 from more2_jax.matching.color import color_of
 from more2_jax.network.embedding_batch import embed
@@ -30,9 +30,8 @@ from more2_jax.types import Instance, ObservedObject, Repair, SceneObject
 
 # Chosen on rooms of regimes `paper`, `sparse` and `real`, docs/developing/notebook/mask_parts.md.
 TOUCHING = 2.0  # distances between neighboring points: parts of one surface lie no farther apart
-LEAST_TOUCHING = (
-    0.5  # of as many points as a line across the smaller has: that many of both lie so near the other
-)
+# Of as many points as a line across the smaller cloud has: so many of both lie that near the other.
+LEAST_TOUCHING = 0.5
 LEAST_ON = 0.3  # share of a part that must lie on the other scan's object, which may be a part itself
 LIKELY = 1.0  # log odds beyond an even chance: what is so likely an object of its own
 LEAST_GAIN = 1.0  # is joined where both together are so much likelier than the likelier of them
@@ -100,8 +99,7 @@ class InstanceParts(Parts):
 
     def whole(self, row: int) -> Points:
         """The object that an instance was found to be, in the scan's frame."""
-        k = self.partner[row]
-        return apply_pose(np.linalg.inv(self.compared.best_pose(k, row)), self.compared.old[k].points)
+        return self.compared.object_there(self.partner[row], row)
 
     def odds_together(self, row: int, part: int) -> float:
         """Log odds of two instances together with the object that the first was found to be."""
@@ -125,8 +123,7 @@ class ObjectParts(Parts):
 
     def whole(self, row: int) -> Points:
         """The instance that an object was found to be, in the scene's frame."""
-        i = self.partner[row]
-        return apply_pose(self.compared.best_pose(row, i), self.compared.new[i].points)
+        return self.compared.instance_there(row, self.partner[row])
 
     def may_be_one(self, row: int, part: int) -> bool:
         """Whether the second was seen once, by the scan that saw the first last: two parts of one mask."""
@@ -170,6 +167,8 @@ def join_parts(whole: Regrouped, compared: Comparison) -> Regrouped | None:
 def touch(one: Points, other: Points) -> bool:
     """Whether two clouds are parts of one surface: along a line, as near one another as their points are."""
     one, other = np.unique(one, axis=0), np.unique(other, axis=0)  # points given twice lie no nearer
+    if min(len(one), len(other)) < 2:
+        return False  # without a distance between neighbors
     tree, there = KDTree(one), KDTree(other)
     spacing = np.median(np.concatenate([t.query(t.data, k=2)[0][:, 1] for t in (tree, there)]))
     near = [t.query(p, distance_upper_bound=TOUCHING * spacing)[0] for t, p in ((tree, other), (there, one))]

@@ -14,7 +14,7 @@ from jaxtyping import Float
 from scipy.spatial import KDTree
 
 from more2_jax.geometry.normalized_cut import Cut, Rows, thinnest_cuts
-from more2_jax.geometry.poses import Points, apply_pose
+from more2_jax.geometry.poses import Points
 from more2_jax.geometry.transform import transform
 from more2_jax.matching.color import color_of
 from more2_jax.network.embedding_batch import embed
@@ -77,14 +77,8 @@ def divisions_of_instances(compared: Comparison, instances: Sequence[Instance]) 
     partner = {f.instance: f.object for f in compared.identified.found}
     wholes = wholes_of(partner, compared.old, compared.odds_of_found(1))
     cuts = {
-        i: cuts_of(
-            compared,
-            compared.new[i].points,
-            apply_pose(np.linalg.inv(compared.best_pose(partner[i], i)), compared.old[partner[i]].points)
-            if i in partner
-            else None,
-        )
-        for i in range(len(instances))
+        i: cuts_of(compared, o.points, compared.object_there(partner[i], i) if i in partner else None)
+        for i, o in enumerate(compared.new)
         if wholes.in_doubt(i)
     }
 
@@ -109,16 +103,13 @@ def divisions_of_objects(compared: Comparison, objects: Sequence[SceneObject]) -
     """Which objects, seen once, are two that the new scan shows apart."""
     partner = {f.object: f.instance for f in compared.identified.found}
     wholes = wholes_of(partner, compared.new, compared.odds_of_found(0))
+    seen_once = [k for k, o in enumerate(objects) if len(o.observations) == 1]
     cuts = {
         k: cuts_of(
-            compared,
-            compared.old[k].points,
-            apply_pose(compared.best_pose(k, partner[k]), compared.new[partner[k]].points)
-            if k in partner
-            else None,
+            compared, compared.old[k].points, compared.instance_there(k, partner[k]) if k in partner else None
         )
-        for k, o in enumerate(objects)
-        if len(o.observations) == 1 and wholes.in_doubt(k)
+        for k in seen_once
+        if wholes.in_doubt(k)
     }
 
     def half(p: Part) -> ObservedObject:

@@ -52,6 +52,11 @@ def test_a_few_stray_points_do_not():
     assert not touch(WHOLE, np.concatenate([SEEN + [3.0, 0, 0], stray]))
 
 
+def test_one_point_given_many_times_touches_nothing():
+    point = np.repeat(WHOLE[:1], 50, axis=0)
+    assert not touch(point, point) and not touch(point, WHOLE) and not touch(WHOLE, point)
+
+
 def pose(axes, angles):
     T = np.eye(4)
     T[:3, :3] = Rotation.from_euler(axes, angles, degrees=True).as_matrix()
