@@ -12,7 +12,7 @@ from dataset_writers.ply_file import vertex_columns, write_ply
 from dataset_writers.scannet import write_scannet
 from dataset_writers.threerscan import write_annotated_mesh, write_semseg
 from furnished import cabinet, chair, corner
-from guide_pages import blocks_of, lines_of
+from guide_pages import blocks, lines
 from places import ROOT
 from scipy.spatial.transform import Rotation
 
@@ -21,9 +21,9 @@ from more2_jax.cli.main import main
 from more2_jax.cli.settings import scene_config
 from more2_jax.storage.scene_folder import load_scene
 
-PAGE = (ROOT / "docs/start/first_scans.md").read_text(encoding="utf-8")
-SCRIPTS = [body for language, body in blocks_of(PAGE) if language == "bash"]
+SCRIPTS = [body for language, body in blocks(ROOT / "docs/start/first_scans.md") if language == "bash"]
 CHAIR, CABINET = 1, 2
+WITH_MASKS, LATER = "more2 show my_room", "more2 add"  # words of two blocks
 CHAIR_MIDDLE = [1.45, 1.45, 0.0]  # meters
 
 
@@ -76,10 +76,8 @@ def scannet(folder: Path) -> None:
         write_scannet(folder / f"scene0000_0{visit}", own_frame(points, visit), segments, groups)
 
 
-# By words of a block: what writes its files, the instances of chair and cabinet in them (none: cut by geometry), labels.
-WITH_MASKS = (labeled_ply, {CHAIR, CABINET}, {None})
+# By words of a block: what writes its files, the instances of chair and cabinet there (none: cut), and labels.
 SOURCES: dict[str, tuple[Callable[[Path], None], set[int], set[str | None]]] = {
-    "more2 show my_room": WITH_MASKS,
     "more2 inspect monday.ply --segment geometric": (phone_ply, set(), {None}),
     "--up y": (phone_ply_y_up, set(), {None}),
     "3RScan/REFERENCE": (threerscan, {2, 3}, {"chair", "cabinet"}),
@@ -100,7 +98,7 @@ def follow(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
 
     def run(script: str) -> None:
-        for line in lines_of(script):
+        for line in lines(script):
             program, *words = shlex.split(line, comments=True)
             assert program == "more2"
             assert main(words) == 0, f"{line}\n{capsys.readouterr().err}"
@@ -121,7 +119,7 @@ def quickly(tmp_path, tiny_prior, monkeypatch):
 
 
 def test_every_block_of_the_page_is_run_here():
-    assert {script_with(words) for words in (*SOURCES, "more2 add")} == set(SCRIPTS)
+    assert {script_with(words) for words in (*SOURCES, WITH_MASKS, LATER)} == set(SCRIPTS)
 
 
 @pytest.mark.no_cover
@@ -141,9 +139,14 @@ def test_the_commands_of_a_source_make_a_scene(words, follow, quickly, tmp_path)
 @pytest.mark.no_cover
 def test_a_scan_is_added_and_the_scene_exported(follow, quickly, tmp_path):
     labeled_ply(tmp_path)
-    follow(script_with("more2 show my_room"))
-    follow(script_with("more2 add"))
-    assert len(load_scene(tmp_path / "my_room")[0].scans) == 3
+    follow(script_with(WITH_MASKS))
+    follow(script_with(LATER))
+    scene = load_scene(tmp_path / "my_room")[0]
+    assert len(scene.scans) == 3
+    assert {x.observations[0].instance for x in scene.objects if x.observations[0].scan == 0} == {
+        CHAIR,
+        CABINET,
+    }
     follow("more2 export my_room --format glb")
     assert trimesh.load(tmp_path / "my_room.glb").geometry
 
