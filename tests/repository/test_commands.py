@@ -1,6 +1,9 @@
-"""The commands of `docs/start/first_scans.md` run word by word, on small true files of every source that it names."""
+"""`more2` commands of the pages run word by word: *Start* on small true files of every source that it names."""
 
+import itertools
+import re
 import shlex
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -8,20 +11,28 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from dataset_writers.masks import write_masks
+from dataset_writers.pcd import write_pcd
 from dataset_writers.ply_file import vertex_columns, write_ply
 from dataset_writers.scannet import write_scannet
 from dataset_writers.threerscan import write_annotated_mesh, write_semseg
+from factories import living_scene
 from furnished import cabinet, chair, corner
-from guide_pages import blocks, lines
+from guide_pages import blocks, commands, lines
 from places import ROOT
 from scipy.spatial.transform import Rotation
 
 from eval.survival import FEW_STEPS
 from more2_jax.cli.main import main
 from more2_jax.cli.settings import scene_config
-from more2_jax.storage.scene_folder import load_scene
+from more2_jax.config import preset
+from more2_jax.network.prior import save_prior
+from more2_jax.report import report_html
+from more2_jax.scans.demo import demo_scan_paths
+from more2_jax.storage.scene_folder import load_scene, save_scene
 
-SCRIPTS = [body for language, body in blocks(ROOT / "docs/start/first_scans.md") if language == "bash"]
+DOCS = ROOT / "docs"
+SCRIPTS = [body for language, body in blocks(DOCS / "start/first_scans.md") if language == "bash"]
 CHAIR, CABINET = 1, 2
 WITH_MASKS, LATER = "more2 show my_room", "more2 add"  # words of two blocks
 CHAIR_MIDDLE = [1.45, 1.45, 0.0]  # meters
@@ -161,3 +172,106 @@ def test_both_objects_are_found_again_with_the_shipped_weights(words, follow, tm
     assert all(len(x.observations) == 2 for x in scene.objects)
     assert [{o.instance for o in x.observations} for x in scene.objects] == [{i} for i in sorted(instances)]
     assert {x.label for x in scene.objects} == labels
+
+
+def more2_of(page: str) -> list[str]:
+    """The `more2` commands of a page."""
+    return [line for line in commands(ROOT / page) if line.startswith("more2 ")]
+
+
+def stored(folder: Path) -> None:
+    """A small scene, with its page."""
+    scene, config = living_scene(), preset("robust", upright=True)
+    save_scene(scene, folder, config, page=report_html(scene, config))
+
+
+def test_a_stored_scene_is_shown_and_exported(follow, tmp_path):
+    stored(tmp_path / "my_room")
+    follow("\n".join(line for line in more2_of("docs/guides/page.md") if "--serve" not in line))
+    follow("\n".join(more2_of("docs/guides/exporting.md")))
+    made = {path.suffix for path in tmp_path.iterdir() if path.is_file()}
+    assert made == {".glb", ".usdc", ".ply", ".json"}
+
+
+def test_an_object_is_found_in_other_rooms(follow, tmp_path, capsys):
+    for room_name in ("room_1", "room_2", "room_3"):
+        stored(tmp_path / "offices" / room_name)
+    follow("\n".join(line for line in more2_of("docs/guides/many_rooms.md") if "batch" not in line))
+    assert "room_2" in capsys.readouterr().out
+
+
+def test_settings_and_weights_are_told(follow, tmp_path, capsys):
+    follow("\n".join(more2_of("docs/concepts/prior.md")[:2]))
+    follow("more2 settings --preset robust")
+    told = capsys.readouterr().out
+    assert "parameters" in told and "memory_mb" in told
+
+
+def test_inspect_prints_what_the_page_of_scans_says(follow, tmp_path, capsys):
+    shutil.copy(demo_scan_paths()[1], tmp_path)
+    (line,) = more2_of("docs/guides/scans.md")
+    follow(line)
+    printed = [body for language, body in blocks(DOCS / "guides/scans.md") if language == "text"]
+    assert capsys.readouterr().out.strip() == printed[0].strip()
+
+
+def prepared(folder: Path, tiny_prior) -> None:
+    """Whatever the pages below name: scans, their masks, settings, weights, and the PCD of a depth camera."""
+    for visit, name in enumerate(("monday", "friday", "sunday")):
+        points, ids = room(visit)
+        write_ply(folder / f"{name}.ply", vertex_columns(points, my_id=ids.astype(np.int32)))
+        write_masks(
+            folder / f"{name}.txt", ids[:, None] == [CHAIR, CABINET], ("chair", "cabinet"), (0.9, 0.8)
+        )
+    points = room(0)[0].astype(np.float32)
+    write_pcd(folder / "monday.pcd", dict(zip("xyz", points.T, strict=True)), "binary")
+    (folder / "mine.yaml").write_text("static_m: 0.1\n")
+    weights = folder / "runs/small/weights.npz"
+    weights.parent.mkdir(parents=True)
+    save_prior(tiny_prior, weights)
+
+
+LONGER = [
+    (page, k)
+    for page in (
+        "guides/masks",
+        "guides/settings",
+        "guides/training",
+        "concepts/robust",
+        "concepts/field",
+        "concepts/paper",
+    )
+    for k, (language, body) in enumerate(blocks(DOCS / f"{page}.md"))
+    if language == "bash" and any(line.startswith(("more2 run", "more2 prior")) for line in lines(body))
+]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("page", "k"), LONGER)
+def test_the_commands_of_a_guide_make_a_scene(page, k, follow, quickly, tmp_path, tiny_prior):
+    prepared(tmp_path, tiny_prior)
+    if page in ("guides/settings", "guides/training") or page.startswith("concepts"):
+        labeled_ply(tmp_path)
+    script = blocks(DOCS / f"{page}.md")[k][1]
+    follow("\n".join(line for line in lines(script) if line.startswith("more2 ")))
+    assert load_scene(tmp_path / "my_room")[0].objects
+
+
+@pytest.mark.slow
+def test_the_readme_prints_what_it_says(follow, tmp_path, capsys):
+    for path in demo_scan_paths()[:2]:
+        shutil.copy(path, tmp_path)
+    script, printed = next(
+        (one[1], two[1]) for one, two in itertools.pairwise(blocks(ROOT / "README.md")) if two[0] == "text"
+    )
+    follow(script)
+    told = capsys.readouterr().out
+    rows = [line for line in printed.splitlines() if line.startswith("│")]
+    assert len(rows) == 8
+    for row in rows:
+        assert without_figures(row) in [without_figures(line) for line in told.splitlines()]
+
+
+def without_figures(row: str) -> list[str]:
+    """The words of a row; figures differ in the last digits from machine to machine."""
+    return re.sub(r"\d[\d.]*", "#", row).split()
