@@ -190,14 +190,16 @@ def test_a_stored_scene_is_shown_and_exported(follow, tmp_path):
     follow("\n".join(line for line in more2_of("docs/guides/page.md") if "--serve" not in line))
     follow("\n".join(more2_of("docs/guides/exporting.md")))
     made = {path.suffix for path in tmp_path.iterdir() if path.is_file()}
-    assert made == {".glb", ".usdc", ".ply", ".json"}
+    assert made == {".glb", ".usda", ".ply", ".json"}
 
 
 def test_an_object_is_found_in_other_rooms(follow, tmp_path, capsys):
     for room_name in ("room_1", "room_2", "room_3"):
         stored(tmp_path / "offices" / room_name)
     follow("\n".join(line for line in more2_of("docs/guides/many_rooms.md") if "batch" not in line))
-    assert "room_2" in capsys.readouterr().out
+    told = capsys.readouterr().out
+    assert "15 objects of 3 scenes" in told
+    assert "object_003" in told
 
 
 def test_settings_and_weights_are_told(follow, tmp_path, capsys):
