@@ -19,6 +19,7 @@ OF_THE_RUN = {"training.seed", "training.validate_every", "training.picture_ever
 SWITCH = {
     "model.decoder.local_channels": "model.decoder.local_blocks",
     "model.decoder.bandwidths": "model.decoder.local_blocks",
+    "model.decoder.surface_bandwidths": "model.decoder.surface_points",
     "training.depth_noise": "training.depth_noise_probability",
     "training.depth_step": "training.depth_noise_probability",
     "training.normal_noise_deg": "model.decoder.normals",
