@@ -17,6 +17,7 @@ from pathlib import Path
 import jax
 import pytest
 import tyro
+from guide_pages import BLOCK, blocks, commands
 from markdown.extensions.toc import slugify
 from places import ROOT
 
@@ -32,25 +33,13 @@ MOST_WORDS = 1500  # of a page, by `wc -w`; a longer one is two pages
 MADE_OF_FIGURES = re.compile(r"<!-- figures: .*?<!-- end of figures -->", re.DOTALL)  # by `eval.docs_figures`
 WRITTEN_BY_PROGRAMS = {"results/census.md"}
 LINK = re.compile(r"\]\(([^)\s#]*)(?:#([^)\s]*))?\)")
-BLOCK = re.compile(r"^```(\w*)\n(.*?)^```", re.DOTALL | re.MULTILINE)
 PROGRAM = re.compile(r"python -m ((?:train|eval)\.[\w.]+)")
 RUN_ELSEWHERE = {"gradients.md"}  # tests/test_docs.py runs it, and looks at the gradient
 SHELL_WORDS = {"python3", "pip", "source", "export", "bash", ".venv/bin/pip"}
 
 
-def blocks(page: Path) -> list[tuple[str, str]]:
-    """Language and text of every fenced block, in order."""
-    return BLOCK.findall(page.read_text(encoding="utf-8"))
-
-
 def named(page: Path) -> str:
     return str(page.relative_to(ROOT))
-
-
-def commands(page: Path) -> list[str]:
-    """The lines of a page's bash blocks, continued ones joined."""
-    text = "\n".join(body for language, body in blocks(page) if language == "bash")
-    return [line for line in text.replace("\\\n", " ").splitlines() if line.strip()]
 
 
 @pytest.fixture(scope="session", autouse=True)
