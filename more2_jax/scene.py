@@ -129,8 +129,7 @@ def add_scan(
     Objects that were absent for a while can come back. Meshes of objects seen again are dropped; `reconstruct`
     makes them anew. Raises ValueError if the scan has no usable instance.
     """
-    config = settled(config, scene.upright)
-    scene = dataclasses.replace(scene, objects=tuple(readable(prior, scene.objects)))
+    config, scene = settled(config, scene.upright), readable(prior, scene)
     level, T_level_scan = leveled_scan(scan, config, scene.scans[0])
     masks, skipped = usable(level, config)
     cleared = without_floor_and_walls(masks, level, config)
@@ -190,11 +189,8 @@ def reconstruct(
     (`paper`): code and poses of all objects are optimized in one call (§3.5). Observations in doubt
     (`Observation.accumulated` False) have no part in it. Objects with a mesh have not changed since and are left alone.
     """
-    config, timing, objects = (
-        settled(config, scene.upright),
-        dict(scene.timing_s),
-        readable(prior, scene.objects),
-    )
+    config, scene = settled(config, scene.upright), readable(prior, scene)
+    timing, objects = dict(scene.timing_s), list(scene.objects)
     todo = [k for k, o in enumerate(objects) if o.mesh is None]
     again = [k for k in todo if len(accumulated(objects[k])) > 1]
     align, fit = again if config.pose_graph.steps else [], again if config.joint.steps else []

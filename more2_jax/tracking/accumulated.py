@@ -11,7 +11,7 @@ from more2_jax.geometry.poses import apply_pose
 from more2_jax.network.embedding_batch import embed
 from more2_jax.network.prior import Prior, anchor_levels
 from more2_jax.tracking.objects import accumulated, accumulated_normals, accumulated_points, reference_pose
-from more2_jax.types import AccumulatedObject, ScanRecord, SceneObject
+from more2_jax.types import AccumulatedObject, LivingScene, ScanRecord, SceneObject
 
 
 def accumulated_object(o: SceneObject, scans: Sequence[ScanRecord]) -> AccumulatedObject:
@@ -64,12 +64,11 @@ def refined_object(o: SceneObject, refined: AccumulatedObject) -> SceneObject:
     )
 
 
-def readable(prior: Prior, objects: Sequence[SceneObject]) -> list[SceneObject]:
-    """The objects, those encoded anew that weights with other look-ups have encoded, as in scenes stored long ago."""
+def readable(prior: Prior, scene: LivingScene) -> LivingScene:
+    """The scene, objects encoded anew that weights with other look-ups have encoded, as in scenes stored long ago."""
     levels = anchor_levels(prior.config)
-    return embed_accumulated(
-        prior, objects, [k for k, o in enumerate(objects) if len(o.embedding.anchors) != levels]
-    )
+    older = [k for k, o in enumerate(scene.objects) if len(o.embedding.anchors) != levels]
+    return dataclasses.replace(scene, objects=tuple(embed_accumulated(prior, scene.objects, older)))
 
 
 def embed_accumulated(

@@ -185,7 +185,8 @@ def test_objects_that_older_weights_encoded_are_encoded_anew(tiny_prior):
         fits, embedding=dataclasses.replace(fits.embedding, anchors=(*fits.embedding.anchors, MARK))
     )
     assert len(older.embedding.anchors) != len(fits.embedding.anchors)
-    kept, anew = readable(tiny_prior, [fits, older])
+    scene = dataclasses.replace(living_scene(), objects=(fits, older))
+    kept, anew = readable(tiny_prior, scene).objects
     assert kept is fits
     expected = embed(tiny_prior, [accumulated_points(fits)])[0]
     jax.tree.map(np.testing.assert_array_equal, anew.embedding, expected)
