@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
+from typing import Any
 
 import flax.linen as nn
 import jax
@@ -136,7 +137,7 @@ class ConvONet(nn.Module):
 
 
 def upright_occupancy_loss(
-    network: nn.Module, params: dict[str, Array], sample: TrainingSample, key: Array
+    network: nn.Module, params: Any, sample: TrainingSample, key: Array
 ) -> Float[Array, ""]:
     """Cross-entropy of inside and outside, every shape turned about the vertical by chance."""
     angles = jax.random.uniform(key, (len(sample.points),), maxval=2 * jnp.pi)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
+from typing import Any
 
 import flax.linen as nn
 import flax.struct
@@ -138,7 +139,7 @@ def pose(
 
 
 def registration_loss(
-    network: nn.Module, params: dict[str, Array], sample: TrainingSample, key: Array
+    network: nn.Module, params: Any, sample: TrainingSample, key: Array
 ) -> Float[Array, ""]:
     """How far points land from where they belong, after every round; and the cross-entropy of their partners.
 
@@ -150,7 +151,7 @@ def registration_loss(
 
 def pair_loss(
     network: nn.Module,
-    params: dict[str, Array],
+    params: Any,
     points: Float[Array, "2 n 3"],
     mask: Bool[Array, "2 n"],
     turn: Float[Array, ""],
@@ -160,7 +161,9 @@ def pair_loss(
     there = target.local(points[0])  # where source points belong
     here = jnp.where(mask[0][:, None], unturned.points * unturned.radius / target.radius, 0.0)
     source = here @ about_vertical(turn).T
-    poses, partners = network.apply(params, source, mask[0], target.points, mask[1])  # type: ignore[misc]
+    given = source, mask[0], target.points, mask[1]
+    found: Any = network.apply(params, *given)
+    poses, partners = found
     landed = jax.vmap(lambda T: source @ T[:3, :3].T + T[:3, 3])(poses)
     error = jnp.where(mask[0][:, None], jnp.abs(landed - there), 0.0).sum(axis=(1, 2)) / mask[0].sum()
     later = 0.5 ** jnp.arange(len(poses) - 1, -1, -1)

@@ -6,6 +6,7 @@ Matching is by the cosine of an invariant code, trained by contrast: two partial
 from __future__ import annotations
 
 from functools import partial
+from typing import Any
 
 import flax.linen as nn
 import jax
@@ -87,9 +88,7 @@ def contrast(codes: Float[Array, "b 2 code"]) -> Float[Array, ""]:
     return sum(both, jnp.zeros(())) / 2
 
 
-def matching_loss(
-    network: nn.Module, params: dict[str, Array], sample: TrainingSample, key: Array
-) -> Float[Array, ""]:
+def matching_loss(network: nn.Module, params: Any, sample: TrainingSample, key: Array) -> Float[Array, ""]:
     """The contrast of a batch."""
     codes = jax.vmap(jax.vmap(partial(network.apply, params)))(sample.points, sample.mask)
     return contrast(jnp.asarray(codes))

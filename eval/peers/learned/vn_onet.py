@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
+from typing import Any
 
 import flax.linen as nn
 import jax
@@ -70,9 +71,7 @@ class VNONet(nn.Module):
         return self.last(nn.relu(x))[:, 0]
 
 
-def occupancy_loss(
-    network: nn.Module, params: dict[str, Array], sample: TrainingSample, key: Array
-) -> Float[Array, ""]:
+def occupancy_loss(network: nn.Module, params: Any, sample: TrainingSample, key: Array) -> Float[Array, ""]:
     """Cross-entropy of inside and outside, both clouds of every shape."""
     of_cloud = jax.vmap(jax.vmap(partial(network.apply, params)))
     logits = of_cloud(sample.points, sample.mask, sample.queries)
