@@ -161,7 +161,7 @@ def shipped() -> list[str]:
 
 def _check(peer: LearnedPeer, name: str, params: Params, path: Path) -> None:
     needed = jax.eval_shape(partial(start, name), 0)
-    shapes = [{k: v.shape for k, v in flatten_dict(tree, sep="/").items()} for tree in (needed, params)]
+    shapes = [jax.tree.map(lambda x: tuple(x.shape), tree) for tree in (needed, params)]
     if shapes[0] != shapes[1]:
         raise ValueError(f"{path}: weights of another form of {peer.title}; train it anew")
 

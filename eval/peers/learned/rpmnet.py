@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from functools import partial
 from typing import Any
 
@@ -106,8 +107,8 @@ class RPMNet(nn.Module):
         for k in range(rounds):
             held = jax.lax.stop_gradient(T)
             R, t = held[:3, :3], held[:3, 3]
-            moved = a.replace(
-                points=jnp.where(source_mask[:, None], a.points @ R.T + t, 0.0), normals=a.normals @ R.T
+            moved = dataclasses.replace(
+                a, points=jnp.where(source_mask[:, None], a.points @ R.T + t, 0.0), normals=a.normals @ R.T
             )
             partners = self._partners(self.features(moved), wanted, source_mask, target_mask, k)
             weights = jnp.exp(partners[:-1, :-1])
