@@ -23,6 +23,7 @@ from eval.harness.program import Program, Summary, carry_out, run_program
 from eval.harness.runs import Run, Work, open_run
 from eval.peers import classifier
 from eval.peers.learned.methods import learned_matchers
+from eval.peers.learned.registry import stated
 from eval.peers.matching import Matcher, matchers
 from eval.scores.figures import COLUMNS, Figure, Record, in_columns
 from eval.scores.match_scores import match_scores, partners
@@ -81,7 +82,7 @@ def prepare(options: Settings) -> tuple[Run, Work]:
     if options.classifier is not None:
         peers |= {classifier.NAME: classifier.classifier(options.classifier, options.batch)}
     peers |= learned_matchers(options.learned)
-    current = open_run("matching", options, {"methods": [*methods, *peers]})
+    current = open_run("matching", options, {"methods": [*methods, *peers], **stated(options.learned)})
     settings = {n: replace(preset(options.preset, upright=upright), matching=m) for n, m in methods.items()}
     return current, lambda scenes: work(scenes, current.prior, settings, peers, options.batch)
 

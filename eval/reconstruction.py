@@ -25,6 +25,7 @@ from eval.harness.options import Options
 from eval.harness.program import Program, Summary, carry_out, run_program
 from eval.harness.runs import Run, Work, open_run
 from eval.peers.learned.methods import learned_surfacers
+from eval.peers.learned.registry import stated
 from eval.peers.reconstruction import SURFACERS, Surfacer
 from eval.scores.figures import Column, Figure, Record
 from eval.scores.mesh_scores import RECONSTRUCTED, mesh_scores
@@ -87,8 +88,9 @@ def main(options: Annotated[Settings, tyro.conf.arg(name="")]) -> None:
 def prepare(options: Settings) -> tuple[Run, Work]:
     """The run, and what is done with its scenes."""
     peers = (SURFACERS if options.peers else {}) | learned_surfacers(options.learned)
-    stated = {"methods": [*own_names(options.preset, preset(options.preset)), *peers], "scans": options.scans}
-    current = open_run("reconstruction", options, {**stated, "samples": options.samples})
+    facts = {"methods": [*own_names(options.preset, preset(options.preset)), *peers], "scans": options.scans}
+    facts |= {"samples": options.samples, **stated(options.learned)}
+    current = open_run("reconstruction", options, facts)
     return current, lambda scenes: work(scenes, current.prior, current.config, peers, options)
 
 

@@ -24,6 +24,7 @@ from eval.harness.plots import draw_ecdf
 from eval.harness.program import Program, Summary, carry_out, run_program
 from eval.harness.runs import Run, Work, open_run
 from eval.peers.learned.methods import learned_registrars
+from eval.peers.learned.registry import stated
 from eval.peers.registration import Registrar, registrars
 from eval.scores.figures import Figure, Record, in_columns
 from eval.scores.pose_scores import Pose, pose_scores
@@ -125,7 +126,8 @@ def prepare(options: Settings) -> tuple[Run, Work]:
     ours = by_preset(options.presets, upright)
     peers = (registrars() if options.peers else {}) | learned_registrars(options.learned)
     methods = [*(m for settings in ours.values() for m in settings), *peers]
-    current = open_run("registration", options, {"methods": methods, "pairs": options.pairs})
+    facts = {"methods": methods, "pairs": options.pairs, **stated(options.learned)}
+    current = open_run("registration", options, facts)
 
     def work(scenes: Sequence[KnownScene]) -> list[list[Record]]:
         pairs = [p for s in scenes for p in true_pairs(s, options.pairs)]

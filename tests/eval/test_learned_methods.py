@@ -51,6 +51,15 @@ def test_weights_come_back_from_their_file(with_tiny, tmp_path):
         np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-6)
 
 
+def test_a_run_states_which_weights_it_asked(with_tiny, tmp_path):
+    save(with_tiny, tmp_path / "one.npz")
+    more = jax.tree.map(lambda x: x + 1, with_tiny.params)
+    save(dataclasses.replace(with_tiny, params=more), tmp_path / "two.npz")
+    one, two = (registry.stated((str(tmp_path / f"{name}.npz"),)) for name in ("one", "two"))
+    assert one.keys() == two.keys() == {"learned"} and one["learned"]["tiny"] != two["learned"]["tiny"]
+    assert registry.stated(()) == {}
+
+
 def test_what_is_no_learned_peer_is_refused(with_tiny, tmp_path, monkeypatch):
     with pytest.raises(ValueError, match="no learned peer 'nonsense' is shipped; there are vn_"):
         load("nonsense")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import zipfile
 from collections.abc import Callable, Mapping
@@ -173,6 +174,15 @@ def of_task(given: tuple[str, ...], task: Task) -> list[Trained]:
         if one.peer.task != task:
             raise ValueError(f"{one.peer.title} is of {one.peer.task}; needed a peer of {task}")
     return found
+
+
+def stated(given: tuple[str, ...]) -> dict[str, dict[str, str]]:
+    """What a run says of them: by title, a digest of the weights. Nothing where none was asked for."""
+    digests = {}
+    for one in map(load, given):
+        content = b"".join(np.ascontiguousarray(x).tobytes() for x in jax.tree.leaves(one.params))
+        digests[one.peer.title] = hashlib.sha256(content).hexdigest()[:12]
+    return {"learned": digests} if digests else {}
 
 
 def parameters(params: Params) -> int:
