@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -72,14 +73,36 @@ def main(
     Console().print(
         f"{peer.title}: {parameters(params):,} parameters, {len(shapes.views)} shapes", highlight=False
     )
+    done = fit(name, params, shapes, jnp.asarray(rows), Length(steps=steps, minutes=minutes), seed, out)
+    save(done, out)
+    Console().print(f"{done.training}", highlight=False)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Length:
+    """How long a run is: of so many steps, or, where these are 0, of so many minutes."""
+
+    steps: int
+    minutes: float  # of processor time
+
+    def share(self, steps: int, began: float) -> float:
+        """How much of it is behind after so many steps since `began`."""
+        return steps / self.steps if self.steps else (time.process_time() - began) / (60 * self.minutes)
+
+
+def fit(
+    name: str, params: Params, shapes: Shapes, rows: Int[Array, " r"], length: Length, seed: int, out: Path
+) -> Trained:
+    """The peer after a run; what it has learned so far is written to `out` every minute."""
+    peer, key = peer_named(name), jax.random.key(seed)
     state: Any = optimizer(peer.learning_rate).init(params)
     losses: list[float] = []
     began = saved = time.process_time()
-    while (share := share_done(len(losses), began, steps, minutes)) < 1:
-        keys = jax.random.split(jax.random.fold_in(jax.random.key(seed), len(losses)))
-        sample = drawn(shapes, jnp.asarray(rows), keys[0], batch=peer.batch, points=peer.points)
-        height = jnp.float32(rate(share) * peer.learning_rate)
-        params, state, loss = step(params, state, sample, keys[1], height, peer=peer)
+    while (share := length.share(len(losses), began)) < 1:
+        keys = jax.random.split(jax.random.fold_in(key, len(losses)))
+        sample = drawn(shapes, rows, keys[0], batch=peer.batch, points=peer.points)
+        learning_rate = jnp.float32(rate(share) * peer.learning_rate)
+        params, state, loss = step(params, state, sample, keys[1], learning_rate, peer=peer)
         losses.append(float(loss))
         if len(losses) == 1:  # compiling is not training
             began = saved = time.process_time()
@@ -87,14 +110,7 @@ def main(
             saved = time.process_time()
             save(trained(name, params, losses, began, len(shapes.views)), out)
             Console().print(f"{len(losses)} steps, loss {np.mean(losses[-100:]):.4f}", highlight=False)
-    done = trained(name, params, losses, began, len(shapes.views))
-    save(done, out)
-    Console().print(f"{done.training}", highlight=False)
-
-
-def share_done(steps_done: int, began: float, steps: int, minutes: float) -> float:
-    """How much of a run is behind: of its steps, or of its minutes."""
-    return steps_done / steps if steps else (time.process_time() - began) / (60 * minutes)
+    return trained(name, params, losses, began, len(shapes.views))
 
 
 def trained(name: str, params: Params, losses: list[float], began: float, shapes: int) -> Trained:
