@@ -156,7 +156,7 @@ def legged(count, seed):
 
 
 def test_what_is_shipped():
-    assert set(shipped()) == {"vn_dgcnn", "vn_onet", "rpmnet", "conv_onet"}
+    assert set(shipped()) == {"vn_dgcnn", "vn_onet", "rpmnet"}
     sizes = [(registry.SHIPPED / f"{name}.npz").stat().st_size for name in shipped()]
     assert max(sizes) < 1e6 and sum(sizes) < 3e6
 
@@ -173,7 +173,7 @@ def test_shipped_weights_find_a_small_turn_of_a_whole_cloud(degrees):
 def test_shipped_weights_enclose_a_box():
     box = trimesh.creation.box((1.0, 0.8, 0.6))
     cloud = np.asarray(trimesh.sample.sample_surface(box, 2000, seed=0)[0]) + 7
-    for name, make in methods.learned_surfacers(("vn_onet", "conv_onet")).items():
+    for name, make in methods.learned_surfacers(("vn_onet",)).items():
         mesh = make(cloud)
         assert mesh is not None, name
         assert trimesh.Trimesh(mesh.vertices, mesh.faces).volume == pytest.approx(0.48, rel=0.5), name
