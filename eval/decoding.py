@@ -30,7 +30,14 @@ from eval.prior_scores import BATCH, SEEN, see_twice
 from eval.scores.figures import Figure, Record, rows_of
 from more2_jax.config import load_config
 from more2_jax.geometry.points import farthest_points
-from more2_jax.network.prior import Prior, encode_ordered, field_sdf, load_prior, object_field
+from more2_jax.network.prior import (
+    Prior,
+    encode_ordered,
+    field_sdf,
+    load_prior,
+    object_field,
+    points_read,
+)
 from train.run.program import run
 from train.run.settings import TrainingConfig, TrainingRun
 from train.run.shape_mix import load_mix
@@ -98,11 +105,11 @@ def trained(
     """Weights of every variant after `steps`."""
     shapes, rows = load_mix(shards, "train")
     codes = encode_ordered(
-        prior, jnp.zeros((prior.config.encoder.points, 3)), jnp.ones(prior.config.encoder.points, bool)
+        prior, jnp.zeros((points_read(prior.config), 3)), jnp.ones(points_read(prior.config), bool)
     )
     weights = start(prior, codes, seed)
     states: dict[str, Any] = {name: optimizer(steps, rate).init(w) for name, w in weights.items()}
-    here, size = jnp.asarray(rows), prior.config.encoder.points
+    here, size = jnp.asarray(rows), points_read(prior.config)
     for number in track(range(steps), description="training"):
         sample, _ = drawn(shapes, here, jnp.asarray(number), config=training, points=size)
         weights, states, losses = decoder_step(
@@ -155,7 +162,7 @@ def score_batch(
 
     def one(cloud: Array, near: Array, uniform: Array) -> dict[str, dict[str, Array]]:
         real = jnp.ones(len(cloud), bool)
-        code = encode_ordered(prior, *farthest_points(cloud, real, prior.config.encoder.points))
+        code = encode_ordered(prior, *farthest_points(cloud, real, points_read(prior.config)))
         fields = {
             name: partial(decoder_of(prior, v).apply, weights[name], code) for name, v in VARIANTS.items()
         } | {OWN: partial(field_sdf, prior, object_field(prior, code))}

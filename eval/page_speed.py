@@ -21,7 +21,7 @@ from rich.console import Console
 from rich.table import Table
 
 from more2_jax.config import SceneConfig
-from more2_jax.network.prior import encode_ordered, load_prior
+from more2_jax.network.prior import encode_ordered, load_prior, points_read
 from more2_jax.report import write_report
 from more2_jax.types import Changes, Embedding, LivingScene, Mesh, Observation, ScanRecord, SceneObject
 from train.run.program import run
@@ -113,7 +113,7 @@ def observation(scan: int, instance: int, shift: float) -> Observation:
 def some_embedding() -> Embedding:
     """An embedding of the right shapes; the page does not show it."""
     prior = load_prior("small")
-    count = prior.config.encoder.points
+    count = points_read(prior.config)
     points = jax.random.normal(jax.random.key(0), (count, 3))
     return jax.tree.map(np.asarray, encode_ordered(prior, points, jnp.ones(count, bool)))
 

@@ -48,6 +48,10 @@ class DecoderConfig:
     # Widths of the look-up when training starts, canonical units.
     bandwidths: tuple[float, ...] = (0.05, 0.15)
     normals: bool = False  # The anchors' normals are looked up too, where they are known.
+    # Beside them this many observed points are looked up, with their normals and without features.
+    surface_points: int = 0
+    # Widths of that look-up when training starts, canonical units.
+    surface_bandwidths: tuple[float, ...] = (0.02, 0.04, 0.08, 0.16)
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ from more2_jax.network.shared_calls import side_by_side
 from more2_jax.progress import Watcher, staged
 from more2_jax.refinement.joint_of_objects import fit_objects
 from more2_jax.refinement.pose_graph_of_objects import refine_object_poses
-from more2_jax.tracking.accumulated import accumulated_objects, embed_accumulated, with_refined
+from more2_jax.tracking.accumulated import accumulated_objects, embed_accumulated, readable, with_refined
 from more2_jax.tracking.changes import changes_between, forgotten, not_seen_in
 from more2_jax.tracking.comparison import Comparison
 from more2_jax.tracking.identify import Found, Identified, identify
@@ -130,6 +130,7 @@ def add_scan(
     makes them anew. Raises ValueError if the scan has no usable instance.
     """
     config = settled(config, scene.upright)
+    scene = dataclasses.replace(scene, objects=tuple(readable(prior, scene.objects)))
     level, T_level_scan = leveled_scan(scan, config, scene.scans[0])
     masks, skipped = usable(level, config)
     cleared = without_floor_and_walls(masks, level, config)
@@ -189,7 +190,11 @@ def reconstruct(
     (`paper`): code and poses of all objects are optimized in one call (§3.5). Observations in doubt
     (`Observation.accumulated` False) have no part in it. Objects with a mesh have not changed since and are left alone.
     """
-    config, timing, objects = settled(config, scene.upright), dict(scene.timing_s), list(scene.objects)
+    config, timing, objects = (
+        settled(config, scene.upright),
+        dict(scene.timing_s),
+        readable(prior, scene.objects),
+    )
     todo = [k for k, o in enumerate(objects) if o.mesh is None]
     again = [k for k in todo if len(accumulated(objects[k])) > 1]
     align, fit = again if config.pose_graph.steps else [], again if config.joint.steps else []

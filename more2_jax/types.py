@@ -90,10 +90,11 @@ class Sampled:
 
 @pytree
 class Anchors:
-    """Points of the observed surface with the encoder's features there: what a local decoder looks up."""
+    """Points of the observed surface, as a rule with the encoder's features there: what a local decoder looks up."""
 
     offset: Float[Array, "*batch a 3"] = quantity("offset")  # meters, relative to the embedding's `center`
-    features: Float[Array, "*batch a 3 f"] = quantity("columns")  # unit norm over (3, f)
+    # Unit norm over (3, f). None: of points that the encoder has no features of.
+    features: Float[Array, "*batch a 3 f"] | None = quantity("columns")
     mask: Bool[Array, "*batch a"] = quantity("invariant")  # True where the anchor is real
     # Unit normals of the surface, outward; zeros where not known. None: nowhere.
     normal: Float[Array, "*batch a 3"] | None = quantity("direction", default=None)

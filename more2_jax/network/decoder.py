@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float
 
 from more2_jax.config import PriorConfig
 from more2_jax.network.local_field import LocalField, LocalLookup, local_width
+from more2_jax.network.surface_lookup import SurfaceField, SurfaceLookup, surface_width
 from more2_jax.network.two_decoders import knows_normals
 from more2_jax.network.vector_neurons import linear
 from more2_jax.types import Embedding, pytree
@@ -30,6 +31,7 @@ class ObjectField:
     center: Float[Array, "3"]
     known: Bool[Array, ""]  # whether any anchor's normal is known
     local: tuple[LocalField, ...] = ()
+    surface: SurfaceField | None = None
 
 
 def product(h: Float[Array, "n i"], kernel: Float[Array, "i o"], train: bool) -> Float[Array, "n o"]:
@@ -74,6 +76,8 @@ class Decoder(nn.Module):
             for i in d.local_blocks
         ]
         self.local_width = len(d.local_blocks) * local_width(d.local_channels, len(d.bandwidths), d.normals)
+        self.surface = SurfaceLookup(d.surface_bandwidths) if d.surface_points else None
+        self.local_width += surface_width(len(d.surface_bandwidths)) if d.surface_points else 0
         self.code_width = 2 * e.code + 1
         self.input_width = self.code_width + self.local_width
         widths = [d.hidden] * d.layers
@@ -105,8 +109,9 @@ class Decoder(nn.Module):
             known=knows_normals(embedding),
             local=tuple(
                 lookup.tabulate(a, embedding.scale)
-                for lookup, a in zip(self.lookups, embedding.anchors, strict=True)
+                for lookup, a in zip(self.lookups, embedding.anchors[: len(self.lookups)], strict=True)
             ),
+            surface=self.surface and self.surface.tabulate(embedding.anchors[-1], embedding.scale),
         )
 
     def _affine(self, e: Embedding, kernel: Float[Array, "i h"], bias: Float[Array, " h"]) -> Affine:
@@ -122,12 +127,8 @@ class Decoder(nn.Module):
         d, kernels = self.config.decoder, self.kernels()
         q = (points - field.center) / field.scale
         length = jnp.sqrt(jnp.maximum(jnp.sum(q * q, axis=-1, keepdims=True), 1e-30))
-        looked_up = [lookup.query(f, q) for lookup, f in zip(self.lookups, field.local, strict=True)]
+        local_features = self._looked_up(field, q)
         q = jnp.concatenate([q, length], axis=-1)
-        # What normals say comes last: rows that a decoder without them does not have.
-        local_features = jnp.concatenate(
-            [q[:, :0], *(f for f, _ in looked_up), *(h for _, h in looked_up)], axis=-1
-        )
         first, skip = (k[len(k) - self.local_width :] for k in (kernels[0][0], kernels[d.skip_layer][0]))
         h = self._activate(q @ field.first[0] + field.first[1] + local_features @ first, train)
         for i in range(1, d.layers):
@@ -139,6 +140,14 @@ class Decoder(nn.Module):
                 h = product(h, kernel, train) + bias
             h = self._activate(h, train)
         return jnp.tanh(self.output(h)[..., 0])
+
+    def _looked_up(self, field: ObjectField, q: Float[Array, "n 3"]) -> Float[Array, "n l"]:
+        local = [lookup.query(f, q) for lookup, f in zip(self.lookups, field.local, strict=True)]
+        surface = (
+            [] if self.surface is None or field.surface is None else [self.surface.query(field.surface, q)]
+        )
+        # What normals and the surface say comes last: rows that a decoder without them does not have.
+        return jnp.concatenate([q[:, :0], *(f for f, _ in local), *(h for _, h in local), *surface], axis=-1)
 
     def _activate(self, h: Float[Array, "n h"], train: bool) -> Float[Array, "n h"]:
         return self.dropout(jax.nn.relu(h), deterministic=not train)

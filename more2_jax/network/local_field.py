@@ -75,6 +75,7 @@ class LocalLookup(nn.Module):
 
     def tabulate(self, anchors: Anchors, scale: Float[Array, ""]) -> LocalField:
         """Every anchor's linear function in absolute form: ⟨p − x, B⟩ + b = ⟨p, B⟩ + (b − ⟨x, B⟩)."""
+        assert anchors.features is not None
         features = anchors.features * jnp.sqrt(1.0 * self.inputs)
         position = anchors.offset / scale
         slope = features @ self.slope

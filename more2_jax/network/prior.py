@@ -25,7 +25,7 @@ from more2_jax.geometry.points import cleared, farthest_rows
 from more2_jax.network.decoder import Decoder, ObjectField
 from more2_jax.network.encoder import Encoder, neighbor_counts
 from more2_jax.network.two_decoders import decoder_weights, knows_normals, without_normals
-from more2_jax.types import Embedding, PointCloud, pytree
+from more2_jax.types import Anchors, Embedding, PointCloud, pytree
 
 FORMAT = 1  # of weight files
 
@@ -68,6 +68,10 @@ def _shapes(config: PriorConfig) -> tuple[dict[str, Any], Embedding]:
     mask = jax.ShapeDtypeStruct((e.points,), bool)
     encoder = Encoder(e, keep=config.decoder.local_blocks)
     embedding, of_encoder = jax.eval_shape(encoder.init_with_output, key, points, mask)
+    seen = jax.ShapeDtypeStruct((config.decoder.surface_points, 3), jnp.float32)
+    embedding = jax.eval_shape(
+        with_surface, embedding, seen, jax.ShapeDtypeStruct(seen.shape[:1], bool), seen
+    )
     decoders = {"decoder": config} | (
         {"bare_decoder": without_normals(config)} if config.bare_decoder else {}
     )
@@ -84,14 +88,48 @@ def encode_ordered(
     normals: Float[Array, "n 3"] | None = None,
     train: bool = False,
 ) -> Embedding:
-    """Φ of one cloud already in farthest-point order, unit normals where known; differentiable.
+    """Φ of one cloud already in farthest-point order, `points_read` rows, unit normals where known; differentiable.
 
     `train`: products with weights are as precise as JAX's default on the device, not fully: rounding is less than a
     batch's noise.
     """
-    encoder = Encoder(prior.config.encoder, keep=prior.config.decoder.local_blocks)
+    c = prior.config
+    encoder = Encoder(c.encoder, keep=c.decoder.local_blocks)
+    # What the decoder sees of the surface beside them is no input of the encoder, whose codes it leaves as they are.
+    first = slice(c.encoder.points if c.decoder.surface_points else None)
+    ahead = points[first], mask[first], None if normals is None else normals[first]
     with nullcontext() if train else jax.default_matmul_precision("highest"):
-        return encoder.apply({"params": prior.params["encoder"]}, points, mask, normals)  # type: ignore[return-value]
+        code: Embedding = encoder.apply({"params": prior.params["encoder"]}, *ahead)  # type: ignore[assignment]
+    if not c.decoder.surface_points:
+        return code
+    last = slice(c.decoder.surface_points)
+    return with_surface(code, points[last], mask[last], None if normals is None else normals[last])
+
+
+def with_surface(
+    code: Embedding,
+    points: Float[Array, "n 3"],
+    mask: Bool[Array, " n"],
+    normals: Float[Array, "n 3"] | None = None,
+) -> Embedding:
+    """The code, and as its last anchors the observed points of the same frame, which have no features."""
+    surface = Anchors(
+        offset=jnp.where(mask[:, None], points - code.center, 0.0),
+        features=None,
+        mask=mask,
+        normal=jnp.zeros_like(points) if normals is None else jnp.where(mask[:, None], normals, 0.0),
+    )
+    return dataclasses.replace(code, anchors=(*code.anchors, surface))
+
+
+def anchor_levels(config: PriorConfig) -> int:
+    """How many levels of anchors an embedding has."""
+    return len(config.decoder.local_blocks) + bool(config.decoder.surface_points)
+
+
+def points_read(config: PriorConfig) -> int:
+    """How many points of a cloud an embedding is made of; the encoder reads the first of them."""
+    return max(config.encoder.points, config.decoder.surface_points)
 
 
 def encode_one(
@@ -102,7 +140,7 @@ def encode_one(
 ) -> Embedding:
     """Φ of one cloud: farthest-point sampling to the encoder's input size, then the network; differentiable."""
     points = cleared(points, mask)
-    index, real = farthest_rows(points, mask, prior.config.encoder.points)
+    index, real = farthest_rows(points, mask, points_read(prior.config))
     return encode_ordered(prior, points[index], real, None if normals is None else normals[index])
 
 
@@ -137,7 +175,7 @@ def encode(prior: Prior, cloud: PointCloud) -> Embedding:
 
 def check_embedding(prior: Prior, embedding: Embedding, who: str) -> None:
     """Raises ValueError unless the decoder can be asked about the embedding, which another encoder may have made."""
-    needed, got = len(prior.config.decoder.local_blocks), len(embedding.anchors)
+    needed, got = anchor_levels(prior.config), len(embedding.anchors)
     if got != needed:
         raise ValueError(
             f"{who} got embeddings with {got} levels of anchors; the decoder of prior {prior.name!r} needed {needed}, "

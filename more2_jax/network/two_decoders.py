@@ -22,9 +22,11 @@ Weights = dict[str, Any]
 
 
 def without_normals(config: PriorConfig) -> PriorConfig:
-    """The settings of the second decoder alone, which looks up no normals."""
+    """The settings of the second decoder alone, which looks up neither normals nor the surface."""
     return dataclasses.replace(
-        config, decoder=dataclasses.replace(config.decoder, normals=False), bare_decoder=False
+        config,
+        decoder=dataclasses.replace(config.decoder, normals=False, surface_points=0),
+        bare_decoder=False,
     )
 
 

@@ -256,8 +256,9 @@ def _stacked(embeddings: list[Embedding]) -> dict[str, np.ndarray]:
         return {k: np.zeros(0) for k in EMBEDDING}
     stacked = {k: np.stack([np.asarray(getattr(e, k)) for e in embeddings]) for k in EMBEDDING}
     for level, name in itertools.product(range(len(embeddings[0].anchors)), ANCHORS):
-        rows = [np.asarray(getattr(e.anchors[level], name)) for e in embeddings]
-        stacked[f"anchors_{level}_{name}"] = np.stack(rows)
+        rows = [getattr(e.anchors[level], name) for e in embeddings]
+        if rows[0] is not None:
+            stacked[f"anchors_{level}_{name}"] = np.stack([np.asarray(row) for row in rows])
     for level in range(len(embeddings[0].anchors)):
         normal = np.stack([_normals(e.anchors[level]) for e in embeddings])
         if normal.any():  # folders of scenes without normals have no such arrays
@@ -276,15 +277,22 @@ def _embeddings(path: Path) -> dict[str, Embedding]:
     levels = sum(k.endswith("_offset") for k in stacked)
 
     def one(n: int) -> Embedding:
-        parts = [{k: stacked[f"anchors_{level}_{k}"][n] for k in ANCHORS} for level in range(levels)]
-        known = [stacked.get(f"anchors_{level}_normal") for level in range(levels)]
-        anchors = [
-            Anchors(**part, normal=np.zeros_like(part["offset"]) if normal is None else normal[n])
-            for part, normal in zip(parts, known, strict=True)
-        ]
-        return Embedding(**{k: stacked[k][n] for k in EMBEDDING}, anchors=tuple(anchors))
+        anchors = tuple(_anchors(stacked, level, n) for level in range(levels))
+        return Embedding(**{k: stacked[k][n] for k in EMBEDDING}, anchors=anchors)
 
     return {str(i): one(n) for n, i in enumerate(stacked["id"])}
+
+
+def _anchors(stacked: dict[str, np.ndarray], level: int, n: int) -> Anchors:
+    """Those of object `n`; what is not stored is not known, or not there."""
+    offset, mask = (stacked[f"anchors_{level}_{k}"][n] for k in ("offset", "mask"))
+    features, normal = (stacked.get(f"anchors_{level}_{k}") for k in ("features", "normal"))
+    return Anchors(
+        offset=offset,
+        features=None if features is None else features[n],
+        mask=mask,
+        normal=np.zeros_like(offset) if normal is None else normal[n],
+    )
 
 
 def _repair(content: dict[str, Any]) -> Repair:

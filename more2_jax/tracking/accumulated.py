@@ -9,7 +9,7 @@ import numpy as np
 
 from more2_jax.geometry.poses import apply_pose
 from more2_jax.network.embedding_batch import embed
-from more2_jax.network.prior import Prior
+from more2_jax.network.prior import Prior, anchor_levels
 from more2_jax.tracking.objects import accumulated, accumulated_normals, accumulated_points, reference_pose
 from more2_jax.types import AccumulatedObject, ScanRecord, SceneObject
 
@@ -61,6 +61,14 @@ def refined_object(o: SceneObject, refined: AccumulatedObject) -> SceneObject:
     )
     return dataclasses.replace(
         o, points=points, normals=normals, observations=observations, embedding=refined.embedding
+    )
+
+
+def readable(prior: Prior, objects: Sequence[SceneObject]) -> list[SceneObject]:
+    """The objects, those encoded anew that weights with other look-ups have encoded, as in scenes stored long ago."""
+    levels = anchor_levels(prior.config)
+    return embed_accumulated(
+        prior, objects, [k for k, o in enumerate(objects) if len(o.embedding.anchors) != levels]
     )
 
 

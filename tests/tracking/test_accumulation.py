@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 
+import jax
 import numpy as np
 import pytest
 from factories import embedding, living_scene, turn_z
@@ -16,7 +17,7 @@ from more2_jax.network.embedding_batch import embed
 from more2_jax.refinement.joint_of_objects import fit_objects
 from more2_jax.scene import add_scan, reconstruct, start_scene
 from more2_jax.storage.scene_folder import load_scene, save_scene
-from more2_jax.tracking.accumulated import accumulated_object, with_refined
+from more2_jax.tracking.accumulated import accumulated_object, readable, with_refined
 from more2_jax.tracking.objects import (
     accumulated,
     accumulated_points,
@@ -175,3 +176,16 @@ def test_the_flag_comes_back_from_the_folder(tmp_path):
     found = next(x for x in again.objects if x.id == o.id)
     assert (found.observations[1].accumulated, found.observations[1].misfit) == (False, 0.7)
     np.testing.assert_array_equal(found.points, o.points)
+
+
+def test_objects_that_older_weights_encoded_are_encoded_anew(tiny_prior):
+    """Scenes stored with another look-up: their embeddings have other anchors, which the decoder cannot read."""
+    fits = seen_twice_and_once_wrongly(tiny_prior)
+    older = dataclasses.replace(
+        fits, embedding=dataclasses.replace(fits.embedding, anchors=(*fits.embedding.anchors, MARK))
+    )
+    assert len(older.embedding.anchors) != len(fits.embedding.anchors)
+    kept, anew = readable(tiny_prior, [fits, older])
+    assert kept is fits
+    expected = embed(tiny_prior, [accumulated_points(fits)])[0]
+    jax.tree.map(np.testing.assert_array_equal, anew.embedding, expected)

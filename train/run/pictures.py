@@ -12,7 +12,7 @@ from jaxtyping import Float, UInt8
 from more2_jax.config import MeshingConfig
 from more2_jax.meshing.extract import extract_mesh
 from more2_jax.network.embedding_batch import embed
-from more2_jax.network.prior import Prior
+from more2_jax.network.prior import Prior, points_read
 from more2_jax.types import Mesh
 from train.run.settings import TrainingConfig
 from train.shards.sampling import sample_batch
@@ -34,7 +34,7 @@ def held_out(prior: Prior, shapes: Shapes, config: TrainingConfig, count: int) -
     """
     index = jnp.asarray(np.linspace(0, len(shapes.views) - 1, min(count, len(shapes.views))).astype(int))
     clean = dataclasses.replace(config, max_views=3, augment_probability=0.0, normals_unknown_probability=0.0)
-    sample = sample_batch(jax.random.key(2), shapes, index, clean, prior.config.encoder.points)
+    sample = sample_batch(jax.random.key(2), shapes, index, clean, points_read(prior.config))
     views = [np.asarray(x[:, 0]) for x in (sample.points, sample.normals, sample.mask)]
     clouds, normals = ([x[i][m] for i, m in enumerate(views[2])] for x in views[:2])
     embeddings = embed(prior, clouds, normals if prior.config.decoder.normals else None)

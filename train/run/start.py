@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from more2_jax.config import PriorConfig
-from more2_jax.network.prior import Prior, encode_ordered, init_prior, load_prior
+from more2_jax.config import DecoderConfig, PriorConfig
+from more2_jax.network.prior import Prior, encode_ordered, init_prior, load_prior, points_read
 from more2_jax.network.two_decoders import with_rows_for_normals, without_normals
 from train.run.settings import TrainingConfig, TrainingRun
 from train.run.shape_mix import ShapeMix
@@ -31,8 +32,8 @@ def started_warm(model: PriorConfig, weights: str, name: str) -> Prior:
     Raises ValueError if they are not of this model.
     """
     prior = one_decoder(load_prior(weights), model.decoder.normals)
-    if model.decoder.normals and not prior.config.decoder.normals:
-        prior = seeing_normals(prior)
+    if shown(prior, model) != prior.config.decoder:
+        prior = seeing(prior, model)
     scale = prior.config.encoder.output_scale  # measured at the start of their training, and theirs for good
     wanted = dataclasses.replace(model, encoder=dataclasses.replace(model.encoder, output_scale=scale))
     if different := [
@@ -47,10 +48,18 @@ def started_warm(model: PriorConfig, weights: str, name: str) -> Prior:
     return dataclasses.replace(prior, name=name)
 
 
-def seeing_normals(prior: Prior) -> Prior:
-    """The same distances from a decoder that looks up normals: what it reads of them has weights of zero."""
-    decoder = dataclasses.replace(prior.config.decoder, normals=True)
-    config = dataclasses.replace(prior.config, decoder=decoder)
+def shown(prior: Prior, model: PriorConfig) -> DecoderConfig:
+    """The settings of the prior's decoder, looking up what `model` looks up besides."""
+    own, wanted = prior.config.decoder, model.decoder
+    more: dict[str, Any] = {"normals": True} if wanted.normals else {}
+    if wanted.surface_points and not own.surface_points:
+        more |= {k: getattr(wanted, k) for k in ("surface_points", "surface_bandwidths")}
+    return dataclasses.replace(own, **more)
+
+
+def seeing(prior: Prior, model: PriorConfig) -> Prior:
+    """The same distances from a decoder that looks up more: what it reads of it has weights of zero."""
+    config = dataclasses.replace(prior.config, decoder=shown(prior, model))
     fresh = init_prior(config, jax.random.key(0)).params["decoder"]
     params = with_rows_for_normals(prior.params["decoder"], fresh)
     return dataclasses.replace(prior, params=prior.params | {"decoder": params}, config=config)
@@ -77,7 +86,7 @@ def calibrated(model: PriorConfig, training: TrainingConfig, train: ShapeMix) ->
     shapes = train.read(np.linspace(0, len(train) - 1, min(CALIBRATED, len(train))).astype(int))
     index = jnp.arange(len(shapes.views))
     shapes = jax.tree.map(jnp.asarray, shapes)
-    sample = sample_batch(jax.random.key(training.seed), shapes, index, training, model.encoder.points)
+    sample = sample_batch(jax.random.key(training.seed), shapes, index, training, points_read(model))
     scale = jax.jit(jax.vmap(partial(encode_ordered, prior)))(sample.points[:, 0], sample.mask[:, 0]).scale
     constant = float(f"{1 / float(scale.mean()):.3g}")
     return dataclasses.replace(model, encoder=dataclasses.replace(model.encoder, output_scale=constant))

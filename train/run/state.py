@@ -14,7 +14,7 @@ from jax.sharding import Mesh
 from jaxtyping import Int
 
 from more2_jax.config import PriorConfig
-from more2_jax.network.prior import Prior
+from more2_jax.network.prior import Prior, points_read
 from more2_jax.types import pytree
 from train.run.devices import by_rows
 from train.run.schedule import learning_rate
@@ -66,7 +66,7 @@ def draw(
     """Samples of shapes `index` and the key of the step's dropout: the same whatever the devices."""
     key = jax.random.fold_in(jax.random.key(config.seed), step)
     sample_key, dropout_key = jax.random.split(key)
-    sample = sample_batch(sample_key, shapes, index, config, model.encoder.points)
+    sample = sample_batch(sample_key, shapes, index, config, points_read(model))
     return jax.lax.with_sharding_constraint(sample, by_rows(mesh)), dropout_key
 
 

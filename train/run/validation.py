@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from more2_jax.geometry.full_precision import full_precision
 from more2_jax.geometry.points import kabsch_rotation
-from more2_jax.network.prior import Prior
+from more2_jax.network.prior import Prior, points_read
 from train.run.settings import TrainingConfig
 from train.shards.losses import predict
 from train.shards.sampling import TrainingSample, sample_batch
@@ -53,7 +53,7 @@ def _scores(
 ) -> dict[str, Array]:
     key = jax.random.fold_in(jax.random.key(1), seed)
     sample = jax.jit(sample_batch, static_argnames=("config", "points"))(
-        key, shapes, index, config, prior.config.encoder.points
+        key, shapes, index, config, points_read(prior.config)
     )
     return _sample_scores(prior, sample)
 
