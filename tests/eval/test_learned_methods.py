@@ -13,7 +13,7 @@ from sphere_shards import sphere_shards
 
 from eval.peers.learned import methods, registry, train
 from eval.peers.learned.clouds import centered
-from eval.peers.learned.occupancy_mesh import surface
+from eval.peers.learned.occupancy_mesh import LEVEL, surface
 from eval.peers.learned.registry import LearnedPeer, Trained, Training, load, save, shipped, start
 from eval.peers.learned.vn_dgcnn import VNDGCNN, matching_loss
 from more2_jax.config import EncoderConfig
@@ -87,7 +87,7 @@ class Ball(nn.Module):
         return centered(points, mask)
 
     def field(self, code, queries):
-        return 0.5 - jnp.linalg.norm(code.local(queries), axis=-1)
+        return LEVEL + 0.5 - jnp.linalg.norm(code.local(queries), axis=-1)
 
     def __call__(self, points, mask, queries):
         return self.field(self.code(points, mask), queries)
@@ -97,7 +97,7 @@ class Nothing(Ball):
     """No place is inside."""
 
     def field(self, code, queries):
-        return -jnp.ones(len(queries))
+        return LEVEL - jnp.ones(len(queries))
 
 
 def test_the_surface_of_a_known_field_is_where_it_is(monkeypatch):
@@ -176,7 +176,9 @@ def test_shipped_weights_enclose_a_box():
     for name, make in methods.learned_surfacers(("vn_onet",)).items():
         mesh = make(cloud)
         assert mesh is not None, name
-        assert trimesh.Trimesh(mesh.vertices, mesh.faces).volume == pytest.approx(0.48, rel=0.5), name
+        solid = trimesh.Trimesh(mesh.vertices, mesh.faces)
+        # Weights of minutes know an object's size and place, hardly its shape.
+        assert solid.is_watertight and box.volume / 2 < solid.volume < 3 * box.volume, name
         np.testing.assert_allclose(mesh.vertices.mean(axis=0), 7, atol=0.2)
 
 

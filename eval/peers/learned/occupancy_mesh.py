@@ -23,6 +23,7 @@ COARSE, FINE = 32, 64  # cells a side, as published at the finest: 128
 REACH = 1.0  # of the cloud's longest edge, from the middle of its box: one view shows no back
 RING = 1  # coarse cells around what is inside
 CHUNK = 8192  # queries a call
+LEVEL = float(np.log(0.2 / 0.8))  # logit of the published threshold: inside from a probability of 0.2
 
 
 @partial(jax.jit, static_argnames="network")
@@ -36,7 +37,7 @@ def _field(network: nn.Module, params: Params, code: Any, queries: Float[Array, 
 
 
 def surface(trained: Trained, cloud: Points) -> Mesh | None:
-    """The closed surface where being inside is as likely as not, meters; None where nothing is inside."""
+    """The closed surface where the probability of being inside passes the published threshold, meters; None where nothing is inside."""
     points, mask, origin = thinned([cloud], trained.peer.points)
     network = trained.peer.network
     code = _code(network, trained.params, points[0], mask[0])
@@ -51,7 +52,7 @@ def surface(trained: Trained, cloud: Points) -> Mesh | None:
         return np.concatenate([np.asarray(p) for p in parts])[: len(at)].reshape(lattice.shape)
 
     coarse = cube(COARSE, REACH * edge)
-    held = np.argwhere(values(coarse) > 0)
+    held = np.argwhere(values(coarse) > LEVEL)
     if not len(held):
         return None
     fine = around(coarse, held)
@@ -68,9 +69,10 @@ def around(coarse: Lattice, held: np.ndarray) -> Lattice:
 def closed_surface(
     values: Float[np.ndarray, "i j k"], lattice: Lattice, shift: Float[np.ndarray, "3"]
 ) -> Mesh | None:
-    """Marching cubes of logits, positive inside, with a ring of outside around them."""
-    if not (values > 0).any():
+    """Marching cubes of logits, higher inside, with a ring of outside around them."""
+    if not (values > LEVEL).any():
         return None
-    outside = np.pad(-values, 1, constant_values=max(float(-values.min()), 1e-3))
+    below = LEVEL - values
+    outside = np.pad(below, 1, constant_values=max(float(below.max()), 1e-3))
     vertices, faces, _, _ = marching_cubes(outside, 0.0, gradient_direction="descent")
     return Mesh(vertices=lattice.at(vertices - 1) + shift, faces=faces.astype(np.int64))
