@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import trimesh
 from known_scenes import pose
+from places import ROOT
 from sphere_shards import sphere_shards
 
 from eval.peers.learned import methods, registry, train
@@ -186,3 +187,12 @@ def test_few_points_have_no_pose():
     few = np.random.default_rng(0).normal(size=(3, 3))
     for register in methods.learned_registrars(("rpmnet",)).values():
         assert register(few, few + 1, False) is None
+
+
+@pytest.mark.parametrize("name", ["vn_dgcnn", "vn_onet", "rpmnet"])
+def test_the_page_states_how_shipped_weights_came_about(name):
+    page, of = (ROOT / "docs/results/learned_peers.md").read_text(encoding="utf-8"), load(name)
+    table = {line.split("|")[1].strip(): line for line in page.splitlines() if line.startswith("| ")}
+    assert f"{registry.parameters(of.params):,}" in table["parameters"]
+    assert f"{of.training.steps:,}, {of.training.clouds:,}" in table["steps, clouds drawn"]
+    assert f"| {of.training.minutes:g} |" in table["minutes of one core"]

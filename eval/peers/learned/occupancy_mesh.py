@@ -37,7 +37,7 @@ def _field(network: nn.Module, params: Params, code: Any, queries: Float[Array, 
 
 
 def surface(trained: Trained, cloud: Points) -> Mesh | None:
-    """The closed surface where the probability of being inside passes the published threshold, meters; None where nothing is inside."""
+    """The closed surface where being inside has the published probability, meters; None where nothing is inside."""
     points, mask, origin = thinned([cloud], trained.peer.points)
     network = trained.peer.network
     code = _code(network, trained.params, points[0], mask[0])
