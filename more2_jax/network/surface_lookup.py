@@ -25,6 +25,7 @@ from more2_jax.types import Anchors, pytree
 
 POSITIONAL = 5  # features a bandwidth that need no normals: two distances, also as shares, and the spread
 GAIN = 20.0  # brings lengths of some hundredths of the canonical unit to the size of shares and of the code
+MOST = 2.0  # of a length that was multiplied by `GAIN`
 # Which features are lengths: of those of a bandwidth (`_distances`, then `plane_features`).
 LENGTHS = (
     True,
@@ -92,9 +93,14 @@ class SurfaceLookup(nn.Module):
                 _distances(q, center, second, bandwidth),
                 plane_features(q, weight, field.planes, field.near_plane, center),
             ]
-        return jnp.concatenate(found, axis=-1) * jnp.tile(
-            jnp.where(jnp.array(LENGTHS), GAIN, 1.0), len(field.bandwidth)
-        )
+        every = jnp.concatenate(found, axis=-1)
+        return jnp.where(jnp.tile(jnp.array(LENGTHS), len(field.bandwidth)), bounded(every), every)
+
+
+def bounded(length: Float[Array, "*n w"]) -> Float[Array, "*n w"]:
+    """`GAIN` times a short length, `MOST` at most: far from the surface its details have no say."""
+    x = GAIN * length
+    return x / jnp.sqrt(1.0 + (x / MOST) ** 2)
 
 
 def _distances(
