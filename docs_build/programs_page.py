@@ -11,7 +11,7 @@ import tyro
 from docs_build.command_line_page import printed_help
 
 ROOT = Path(__file__).parents[1]
-FOLDERS = ("train", "train/tools", "eval", "eval/peers")
+FOLDERS = ("train", "train/tools", "eval", "eval/peers", "eval/peers/learned")
 STARTED = re.compile(
     r"^def main\(.*^if __name__ == ", re.MULTILINE | re.DOTALL
 )  # in a module that is a program

@@ -22,6 +22,8 @@ from eval.harness.options import OptionsBeside, benchmark, is_upright
 from eval.harness.program import Program, Summary, carry_out, run_program
 from eval.harness.runs import Run, Work, open_run
 from eval.peers import classifier
+from eval.peers.learned.methods import learned_matchers
+from eval.peers.learned.registry import stated
 from eval.peers.matching import Matcher, matchers
 from eval.scores.figures import COLUMNS, Figure, Record, in_columns
 from eval.scores.match_scores import match_scores, partners
@@ -63,6 +65,8 @@ class Settings(OptionsBeside):
 
     classifier: Path | None = None
     """Weights of `eval.peers.classifier`, to be matched with too."""
+    learned: tuple[str, ...] = ()
+    """Learned peers measured too: names of shipped weights, or files of `eval.peers.learned.train`."""
 
 
 def main(options: Annotated[Settings, tyro.conf.arg(name="")]) -> None:
@@ -77,7 +81,8 @@ def prepare(options: Settings) -> tuple[Run, Work]:
     peers = matchers(upright) if options.peers else {}
     if options.classifier is not None:
         peers |= {classifier.NAME: classifier.classifier(options.classifier, options.batch)}
-    current = open_run("matching", options, {"methods": [*methods, *peers]})
+    peers |= learned_matchers(options.learned)
+    current = open_run("matching", options, {"methods": [*methods, *peers], **stated(options.learned)})
     settings = {n: replace(preset(options.preset, upright=upright), matching=m) for n, m in methods.items()}
     return current, lambda scenes: work(scenes, current.prior, settings, peers, options.batch)
 

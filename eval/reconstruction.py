@@ -24,6 +24,8 @@ from eval.harness.batched import embed_all
 from eval.harness.options import Options
 from eval.harness.program import Program, Summary, carry_out, run_program
 from eval.harness.runs import Run, Work, open_run
+from eval.peers.learned.methods import learned_surfacers
+from eval.peers.learned.registry import stated
 from eval.peers.reconstruction import SURFACERS, Surfacer
 from eval.scores.figures import Column, Figure, Record
 from eval.scores.mesh_scores import RECONSTRUCTED, mesh_scores
@@ -45,6 +47,8 @@ class Settings(Options):
     """How many scans are accumulated, under their true poses."""
     samples: int = 100_000
     """Points on each surface, and in the box of the inside tests."""
+    learned: tuple[str, ...] = ()
+    """Learned peers measured too: names of shipped weights, or files of `eval.peers.learned.train`."""
 
 
 def _of(name: str, key: str, column: Column, **more: object) -> Figure:
@@ -83,9 +87,10 @@ def main(options: Annotated[Settings, tyro.conf.arg(name="")]) -> None:
 
 def prepare(options: Settings) -> tuple[Run, Work]:
     """The run, and what is done with its scenes."""
-    peers = SURFACERS if options.peers else {}
-    stated = {"methods": [*own_names(options.preset, preset(options.preset)), *peers], "scans": options.scans}
-    current = open_run("reconstruction", options, {**stated, "samples": options.samples})
+    peers = (SURFACERS if options.peers else {}) | learned_surfacers(options.learned)
+    facts = {"methods": [*own_names(options.preset, preset(options.preset)), *peers], "scans": options.scans}
+    facts |= {"samples": options.samples, **stated(options.learned)}
+    current = open_run("reconstruction", options, facts)
     return current, lambda scenes: work(scenes, current.prior, current.config, peers, options)
 
 

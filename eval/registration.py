@@ -23,6 +23,8 @@ from eval.harness.options import OptionsBeside, benchmark, is_upright
 from eval.harness.plots import draw_ecdf
 from eval.harness.program import Program, Summary, carry_out, run_program
 from eval.harness.runs import Run, Work, open_run
+from eval.peers.learned.methods import learned_registrars
+from eval.peers.learned.registry import stated
 from eval.peers.registration import Registrar, registrars
 from eval.scores.figures import Figure, Record, in_columns
 from eval.scores.pose_scores import Pose, pose_scores
@@ -49,6 +51,8 @@ class Settings(OptionsBeside):
 
     pairs: Literal["first", "all"] = "all"
     """Every later scan onto the first, or only the second (as the published evaluation of FlyingShape has it)."""
+    learned: tuple[str, ...] = ()
+    """Learned peers measured too: names of shipped weights, or files of `eval.peers.learned.train`."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -120,9 +124,10 @@ def prepare(options: Settings) -> tuple[Run, Work]:
     """The run, and what is done with its scenes."""
     upright = is_upright(options, benchmark(options))
     ours = by_preset(options.presets, upright)
-    peers = registrars() if options.peers else {}
+    peers = (registrars() if options.peers else {}) | learned_registrars(options.learned)
     methods = [*(m for settings in ours.values() for m in settings), *peers]
-    current = open_run("registration", options, {"methods": methods, "pairs": options.pairs})
+    facts = {"methods": methods, "pairs": options.pairs, **stated(options.learned)}
+    current = open_run("registration", options, facts)
 
     def work(scenes: Sequence[KnownScene]) -> list[list[Record]]:
         pairs = [p for s in scenes for p in true_pairs(s, options.pairs)]

@@ -1,0 +1,99 @@
+"""Trained peers as the tables of matching, registration and reconstruction take them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+
+import flax.linen as nn
+import jax
+import numpy as np
+from jax import Array
+from jaxtyping import Bool, Float
+
+from eval.peers.learned.clouds import centered, thinned
+from eval.peers.learned.occupancy_mesh import surface
+from eval.peers.learned.registry import Params, Trained, of_task
+from eval.peers.learned.rpmnet import ROUNDS
+from eval.peers.matching import Matched, Matcher, assigned
+from eval.peers.reconstruction import Surfacer
+from eval.peers.registration import FEWEST, Registrar, diagonal, refined
+from more2_jax.geometry.poses import Points, Pose
+from more2_jax.types import Instance
+
+
+def learned_matchers(given: tuple[str, ...]) -> dict[str, Matcher]:
+    """By title: Hungarian on the cosine of codes. ValueError as `of_task`."""
+    return {t.peer.title: partial(by_code, t) for t in of_task(given, "matching")}
+
+
+def learned_surfacers(given: tuple[str, ...]) -> dict[str, Surfacer]:
+    """By title: the surface of the occupancy. ValueError as `of_task`."""
+    return {t.peer.title: partial(surface, t) for t in of_task(given, "reconstruction")}
+
+
+def learned_registrars(given: tuple[str, ...]) -> dict[str, Registrar]:
+    """By title: the network alone, and with GICP after it. ValueError as `of_task`."""
+    found: dict[str, Registrar] = {}
+    for t in of_task(given, "registration"):
+        found |= {t.peer.title: partial(by_rounds, t), f"{t.peer.title} + GICP": partial(then_gicp, t)}
+    return found
+
+
+@partial(jax.jit, static_argnames="network")
+def _codes(
+    network: nn.Module, params: Params, points: Float[Array, "1 n 3"], mask: Bool[Array, "1 n"]
+) -> Float[Array, "1 code"]:
+    return jax.vmap(partial(network.apply, params))(points, mask)  # type: ignore[arg-type]
+
+
+def codes(trained: Trained, clouds: Sequence[Points]) -> Float[np.ndarray, "b code"]:
+    """A unit code a cloud."""
+    points, mask, _ = thinned(clouds, trained.peer.points)
+    one = partial(_codes, trained.peer.network, trained.params)
+    return np.concatenate([np.asarray(one(p[None], m[None])) for p, m in zip(points, mask, strict=True)])
+
+
+def by_code(trained: Trained, one: Sequence[Instance], other: Sequence[Instance]) -> Matched:
+    """Hungarian on the cosine."""
+    if not one or not other:
+        return {}
+    found = codes(trained, [i.points for i in (*one, *other)])
+    return assigned(one, other, -found[: len(one)] @ found[len(one) :].T)
+
+
+@partial(jax.jit, static_argnames=("network", "upright"))
+def _rounds(
+    network: nn.Module, params: Params, points: Float[Array, "2 n 3"], mask: Bool[Array, "2 n"], upright: bool
+) -> tuple[Float[Array, "4 4"], Float[Array, "2 3"], Float[Array, ""]]:
+    source, target = (centered(points[i], mask[i]) for i in (0, 1))
+    unit = target.radius
+    moved = source.points * source.radius / unit
+    poses, _ = network.apply(params, moved, mask[0], target.points, mask[1], ROUNDS, upright)  # type: ignore[misc]
+    return poses[-1], jax.numpy.stack([source.mean, target.mean]), unit
+
+
+def by_rounds(trained: Trained, source: Points, target: Points, upright: bool) -> Pose | None:
+    """The network's own pose from no start but the clouds' means, meters; None of next to nothing."""
+    if min(len(source), len(target)) < FEWEST:
+        return None
+    points, mask, origin = thinned([source, target], trained.peer.points)
+    T, means, unit = map(np.asarray, _rounds(trained.peer.network, trained.params, points, mask, upright))
+    if not np.isfinite(T).all():
+        return None
+    means = means + origin
+    pose = np.eye(4)
+    pose[:3, :3] = T[:3, :3]
+    pose[:3, 3] = T[:3, 3] * float(unit) + means[1] - T[:3, :3] @ means[0]
+    return pose
+
+
+def then_gicp(trained: Trained, source: Points, target: Points, upright: bool) -> Pose | None:
+    """The network's pose, refined by GICP as those of the peers that learn nothing."""
+    found = by_rounds(trained, source, target, upright)
+    if found is None:
+        return None
+    start = found.copy()  # as `refined` takes it: between clouds about their means, in the target's diagonals
+    R, means = found[:3, :3], (source.mean(axis=0), target.mean(axis=0))
+    start[:3, 3] = (found[:3, 3] + R @ means[0] - means[1]) / diagonal(target)
+    return refined(source, target, [start])

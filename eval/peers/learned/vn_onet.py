@@ -1,0 +1,78 @@
+"""VN-ONet (Deng et al., Vector Neurons, ICCV 2021): occupancy asked by products that do not change by turning."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import optax
+from jax import Array
+from jaxtyping import Bool, Float
+
+from eval.peers.learned.clouds import Centered, centered
+from eval.peers.learned.vn_dgcnn import GRAPH, GraphVectors, Invariants
+from more2_jax.config import EncoderConfig
+from more2_jax.network.vector_neurons import channel_normalize, masked_mean
+from train.shards.sampling import TrainingSample
+
+HIDDEN, BLOCKS = 128, 3  # of the decoder; published: 256, 5
+
+
+class ResidualBlock(nn.Module):
+    """Two layers beside a shortcut (ResnetBlockFC)."""
+
+    hidden: int
+
+    @nn.compact
+    def __call__(self, x: Float[Array, "q h"]) -> Float[Array, "q h"]:
+        return x + nn.Dense(self.hidden)(nn.relu(nn.Dense(self.hidden)(nn.relu(x))))
+
+
+class VNONet(nn.Module):
+    """A cloud to a field of occupancy that turns, moves and scales along with it."""
+
+    config: EncoderConfig = GRAPH
+
+    def setup(self) -> None:
+        self.graph, self.invariants = GraphVectors(self.config), Invariants(self.config.leak)
+        self.query = nn.Dense(HIDDEN)
+        self.blocks = [ResidualBlock(HIDDEN) for _ in range(BLOCKS)]
+        self.codes = [nn.Dense(HIDDEN) for _ in range(BLOCKS)]
+        self.last = nn.Dense(1)
+
+    def __call__(
+        self, points: Float[Array, "n 3"], mask: Bool[Array, " n"], queries: Float[Array, "q 3"]
+    ) -> Float[Array, " q"]:
+        """Logits of being inside, at points of the cloud's frame."""
+        return self.field(self.code(points, mask), queries)
+
+    def code(
+        self, points: Float[Array, "n 3"], mask: Bool[Array, " n"]
+    ) -> tuple[Float[Array, "3 c"], Centered]:
+        """Vectors of unit mean length that turn with the cloud, and where it lies."""
+        cloud = centered(points, mask)
+        vectors, left = self.graph(cloud.points, cloud.mask)
+        return channel_normalize(masked_mean(vectors, left)) * self.config.code**0.5, cloud
+
+    def field(
+        self, code: tuple[Float[Array, "3 c"], Centered], queries: Float[Array, "q 3"]
+    ) -> Float[Array, " q"]:
+        """Logits at points of the cloud's frame: of ‖q‖², ⟨q, vector⟩ and the code's invariants."""
+        vectors, cloud = code
+        at = cloud.local(queries)
+        squared = jnp.sum(at**2, axis=-1, keepdims=True)
+        x = self.query(jnp.concatenate([at @ vectors, squared], axis=-1))
+        invariant = self.invariants(vectors)
+        for block, own in zip(self.blocks, self.codes, strict=True):
+            x = block(x + own(invariant))
+        return self.last(nn.relu(x))[:, 0]
+
+
+def occupancy_loss(network: nn.Module, params: Any, sample: TrainingSample, key: Array) -> Float[Array, ""]:
+    """Cross-entropy of inside and outside, both clouds of every shape."""
+    of_cloud = jax.vmap(jax.vmap(partial(network.apply, params)))
+    logits = of_cloud(sample.points, sample.mask, sample.queries)
+    return optax.sigmoid_binary_cross_entropy(jnp.asarray(logits), sample.sdf < 0).mean()
