@@ -62,6 +62,7 @@ class PriorConfig:
     decoder: DecoderConfig = field(default_factory=DecoderConfig)
     eqv_gain: float = 1.0  # F_eqv is multiplied by this for the decoder.
     inv_gain: float = 1.0  # F_inv is multiplied by this for the decoder.
+    bare_decoder: bool = False  # Whether a second decoder answers for objects of which no normal is known.
 
 
 @dataclass(frozen=True)
@@ -317,7 +318,6 @@ RENAMED = {
 # Settings of older files that are constants now, by class, with the only value they may have.
 NOW_CONSTANT: dict[str, dict[str, Any]] = {
     "MeshingConfig": {"half_width": 0.65},
-    "PriorConfig": {"bare_decoder": False},
     "PoseGraphConfig": {"points": 1024, "first_reach": 0.05, "last_reach": 0.001, "most_turn_deg": 3.0},
 }
 

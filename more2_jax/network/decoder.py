@@ -6,11 +6,12 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 from jax import Array
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from more2_jax.config import PriorConfig
 from more2_jax.network.local_field import LocalField, LocalLookup, local_width
 from more2_jax.network.surface_lookup import SurfaceField, SurfaceLookup, surface_width
+from more2_jax.network.two_decoders import knows_normals
 from more2_jax.network.vector_neurons import linear
 from more2_jax.types import Embedding, pytree
 
@@ -28,6 +29,7 @@ class ObjectField:
     skip: Affine
     scale: Float[Array, ""]
     center: Float[Array, "3"]
+    known: Bool[Array, ""]  # whether any anchor's normal is known
     local: tuple[LocalField, ...] = ()
     surface: SurfaceField | None = None
 
@@ -104,6 +106,7 @@ class Decoder(nn.Module):
             skip=self._affine(embedding, skip[-self.input_width :], skip_bias),
             scale=embedding.scale,
             center=embedding.center,
+            known=knows_normals(embedding),
             local=tuple(
                 lookup.tabulate(a, embedding.scale)
                 for lookup, a in zip(self.lookups, embedding.anchors[: len(self.lookups)], strict=True)

@@ -24,6 +24,7 @@ from more2_jax.geometry.full_precision import full_precision
 from more2_jax.geometry.points import cleared, farthest_rows
 from more2_jax.network.decoder import Decoder, ObjectField
 from more2_jax.network.encoder import Encoder, neighbor_counts
+from more2_jax.network.two_decoders import decoder_weights, knows_normals, without_normals
 from more2_jax.types import Anchors, Embedding, PointCloud, pytree
 
 FORMAT = 1  # of weight files
@@ -48,6 +49,9 @@ def init_prior(config: PriorConfig, key: Array, name: str = "random") -> Prior:
     encoder = jax.jit(Encoder(e, keep=config.decoder.local_blocks).init)(encoder_key, points, mask)
     decoder = jax.jit(Decoder(config).init)(decoder_key, embedding, points[:1])
     params = {"encoder": dict(encoder["params"]), "decoder": dict(decoder["params"])}
+    if config.bare_decoder:
+        bare = jax.jit(Decoder(without_normals(config)).init)(decoder_key, embedding, points[:1])
+        params["bare_decoder"] = dict(bare["params"])
     return Prior(params=params, config=config, name=name)
 
 
@@ -68,8 +72,13 @@ def _shapes(config: PriorConfig) -> tuple[dict[str, Any], Embedding]:
     embedding = jax.eval_shape(
         with_surface, embedding, seen, jax.ShapeDtypeStruct(seen.shape[:1], bool), seen
     )
-    of_decoder = jax.eval_shape(Decoder(config).init, key, embedding, one)
-    return {"encoder": of_encoder["params"], "decoder": of_decoder["params"]}, embedding
+    decoders = {"decoder": config} | (
+        {"bare_decoder": without_normals(config)} if config.bare_decoder else {}
+    )
+    of_decoders = {
+        k: jax.eval_shape(Decoder(c).init, key, embedding, one)["params"] for k, c in decoders.items()
+    }
+    return {"encoder": of_encoder["params"]} | of_decoders, embedding
 
 
 def encode_ordered(
@@ -177,15 +186,15 @@ def check_embedding(prior: Prior, embedding: Embedding, who: str) -> None:
 @full_precision
 def object_field(prior: Prior, embedding: Embedding) -> ObjectField:
     """Folds one object's code into the decoder; then `field_sdf` is cheap for many points."""
-    weights = {"params": prior.params["decoder"]}
-    return Decoder(prior.config).apply(weights, embedding, method="field")  # type: ignore[return-value]
+    weights = decoder_weights(prior.params, prior.config, knows_normals(embedding))
+    return Decoder(prior.config).apply({"params": weights}, embedding, method="field")  # type: ignore[return-value]
 
 
 @full_precision
 def field_sdf(prior: Prior, field: ObjectField, points: Float[Array, "n 3"]) -> Float[Array, " n"]:
     """Signed distance at points of the embedding's local frame; canonical units, negative inside."""
-    weights = {"params": prior.params["decoder"]}
-    return Decoder(prior.config).apply(weights, field, points, method="distance")  # type: ignore[return-value]
+    weights = decoder_weights(prior.params, prior.config, field.known)
+    return Decoder(prior.config).apply({"params": weights}, field, points, method="distance")  # type: ignore[return-value]
 
 
 def sdf_one(prior: Prior, embedding: Embedding, points: Float[Array, "n 3"]) -> Float[Array, " n"]:

@@ -39,6 +39,7 @@ NEVER_MOVED = {
     "Prior",
     "ObjectField",
     "LocalField",
+    "SurfaceField",
     "Matches",
     "Correspondences",
     "NormalEquations",

@@ -24,6 +24,7 @@ from more2_jax.network.prior import (
     sdf_one,
 )
 from more2_jax.network.surface_lookup import POSITIONAL, SurfaceLookup, bounded, surface_width
+from more2_jax.network.two_decoders import without_normals
 from more2_jax.types import Anchors
 from train.run.settings import TrainingRun
 from train.run.start import started_warm
@@ -195,6 +196,16 @@ def test_a_decoder_that_begins_to_see_the_surface_says_what_it_said(cloud, tmp_p
         started_warm(model(surface_points=0), str(tmp_path / "seeing.npz"), "mine")
 
 
-def test_settings_are_stored_with_the_weights(prior, tmp_path):
+def test_settings_are_stored_with_the_weights_and_a_bare_decoder_sees_none_of_it(prior, cloud, tmp_path):
     save_prior(prior, tmp_path / "seen.npz", half=False)
     assert load_prior(tmp_path / "seen.npz").config == prior.config
+    assert not without_normals(prior.config).decoder.surface_points
+    both = random_prior(dataclasses.replace(prior.config, bare_decoder=True))
+    points, q = cloud[0], 1.2 * cloud[0][:40]
+    bare = dataclasses.replace(
+        both,
+        params={"encoder": both.params["encoder"], "decoder": both.params["bare_decoder"]},
+        config=without_normals(both.config),
+    )
+    e, own = (placed(p, points, jnp.ones(len(points), bool)) for p in (both, bare))
+    np.testing.assert_allclose(field(both, e, q), field(bare, own, q), atol=2e-6)

@@ -16,9 +16,7 @@ import pytest
 from places import DATA, ROOT
 
 from more2_jax.geometry.padding import pad_clouds
-from more2_jax.network.local_field import NORMAL_FEATURES
 from more2_jax.network.prior import encode, load_prior
-from more2_jax.network.surface_lookup import surface_width
 from more2_jax.storage.scene_folder import load_scene, save_scene, scene_to_json
 from more2_jax.types import LivingScene
 
@@ -88,22 +86,15 @@ def test_settings_are_what_they_were(folder):
 
 
 def test_stored_weights_give_the_same_codes(tmp_path):
-    """Of a file with the header of that version: `neighbours` as it spelled them; neither normals nor surface."""
+    """Of a file with the header of that version: `neighbours` as it spelled them, and one decoder, without normals."""
     with np.load(ROOT / "more2_jax/assets/weights/small.npz") as file:
         arrays, header = dict(file), json.loads(str(file["__header__"]))
     config = header["config"]
     config["encoder"]["neighbours"] = neighbors = config["encoder"].pop("neighbors")
-    more = len(config["decoder"]["local_blocks"]) * NORMAL_FEATURES
-    more += surface_width(len(config["decoder"]["surface_bandwidths"]))
-    for key in ("normals", "surface_points", "surface_bandwidths"):
-        del config["decoder"][key]
-    later = ("decoder/surface", "__header__")
-    then = {k: v for k, v in arrays.items() if not k.startswith(later) and "near_plane" not in k}
-    for layer in (
-        0,
-        config["decoder"]["skip_layer"],
-    ):  # what is read of normals and of the surface comes last
-        then[f"decoder/layer_{layer}/direction"] = then[f"decoder/layer_{layer}/direction"][:-more]
+    del config["decoder"]["normals"], config["bare_decoder"]
+    then = {
+        k.removeprefix("bare_"): v for k, v in arrays.items() if k.startswith(("encoder/", "bare_decoder/"))
+    }
     np.savez(tmp_path / "then.npz", __header__=np.array(json.dumps(header)), **then)
     prior = load_prior(tmp_path / "then.npz")
     assert prior.config.encoder.neighbors == neighbors

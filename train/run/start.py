@@ -9,11 +9,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from flax.traverse_util import flatten_dict, unflatten_dict
-from jax import Array
 
 from more2_jax.config import DecoderConfig, PriorConfig
 from more2_jax.network.prior import Prior, encode_ordered, init_prior, load_prior, points_read
+from more2_jax.network.two_decoders import with_rows_for_normals, without_normals
 from train.run.settings import TrainingConfig, TrainingRun
 from train.run.shape_mix import ShapeMix
 from train.shards.sampling import sample_batch
@@ -32,7 +31,7 @@ def started_warm(model: PriorConfig, weights: str, name: str) -> Prior:
 
     Raises ValueError if they are not of this model.
     """
-    prior = load_prior(weights)
+    prior = one_decoder(load_prior(weights), model.decoder.normals)
     if shown(prior, model) != prior.config.decoder:
         prior = seeing(prior, model)
     scale = prior.config.encoder.output_scale  # measured at the start of their training, and theirs for good
@@ -62,23 +61,22 @@ def seeing(prior: Prior, model: PriorConfig) -> Prior:
     """The same distances from a decoder that looks up more: what it reads of it has weights of zero."""
     config = dataclasses.replace(prior.config, decoder=shown(prior, model))
     fresh = init_prior(config, jax.random.key(0)).params["decoder"]
-    params = with_rows_of_zeros(prior.params["decoder"], fresh)
+    params = with_rows_for_normals(prior.params["decoder"], fresh)
     return dataclasses.replace(prior, params=prior.params | {"decoder": params}, config=config)
 
 
-def with_rows_of_zeros(known: dict[str, Any], wanted: dict[str, Any]) -> dict[str, Any]:
-    """A decoder's weights in the shapes of one that looks up more: what it reads of that has weights of zero.
-
-    Such rows come last in every kernel, and columns keep their lengths, which weight normalization needs.
-    """
-    own: dict[str, Array] = dict(flatten_dict(known, sep="/"))  # type: ignore[arg-type]
-    like: dict[str, Array] = dict(flatten_dict(wanted, sep="/"))  # type: ignore[arg-type]
-    filled = {}
-    for name, shaped in like.items():
-        value = own.get(name, shaped)
-        missing = len(shaped) - len(value) if np.ndim(value) else 0
-        filled[name] = jnp.pad(value, [(0, missing), *[(0, 0)] * (np.ndim(value) - 1)]) if missing else value
-    return unflatten_dict(filled, sep="/")
+def one_decoder(prior: Prior, normals: bool) -> Prior:
+    """Of a prior with two decoders the one that reads normals, or the one that reads none; any other prior as it is."""
+    if not prior.config.bare_decoder:
+        return prior
+    params = {
+        "encoder": prior.params["encoder"],
+        "decoder": prior.params["decoder" if normals else "bare_decoder"],
+    }
+    seeing = dataclasses.replace(prior.config, bare_decoder=False)
+    return dataclasses.replace(
+        prior, params=params, config=seeing if normals else without_normals(prior.config)
+    )
 
 
 def calibrated(model: PriorConfig, training: TrainingConfig, train: ShapeMix) -> PriorConfig:

@@ -24,6 +24,7 @@ from more2_jax.config import DecoderConfig, PriorConfig, load_config
 from more2_jax.network.prior import Prior, init_prior, load_prior, save_prior
 from train.run.program import run
 from train.run.settings import TrainingRun
+from train.run.start import one_decoder
 
 Weights = dict[str, np.ndarray]
 Parts = Sequence[tuple[int, int]]  # widths, before and after, of what stands side by side in a matrix' rows
@@ -87,6 +88,7 @@ def widen(prior: Prior, config: PriorConfig, key: Array) -> Prior:
     To rounding, and where `points`, `neighbors` and `downsample_factors` are equal. Raises ValueError, naming the
     setting, where `config` is narrower or of another structure.
     """
+    prior = one_decoder(prior, config.decoder.normals)
     check(prior.config, config)
     # F_s is a mean over the channels of the code, new ones included.
     more = config.encoder.code / prior.config.encoder.code
@@ -97,7 +99,7 @@ def widen(prior: Prior, config: PriorConfig, key: Array) -> Prior:
     for name, old in known.items():
         if name.startswith("encoder/"):
             wide[name] = encoder_weights(name, fresh[name], old, config.encoder.linear_blocks, more)
-        elif name.startswith(("decoder/local_", "decoder/surface")):
+        elif name.startswith("decoder/local_"):
             wide[name] = lookup_weights(fresh[name], old)
     params = unflatten_dict({k: jnp.asarray(v, jnp.float32) for k, v in wide.items()}, sep="/")
     return Prior(params=params, config=config, name=prior.name)
@@ -141,7 +143,7 @@ def encoder_weights(
 
 def lookup_weights(fresh: np.ndarray, known: np.ndarray) -> np.ndarray:
     """A matrix of a look-up, whose inputs are multiplied by the root of their number; or its bandwidths."""
-    if known.ndim <= 1:
+    if known.ndim == 1:
         return known
     share = np.sqrt(len(known) / len(fresh))
     columns = [(known.shape[1], fresh.shape[1])]
@@ -196,7 +198,7 @@ def known_layer(known: Weights, config: DecoderConfig, layer: int | None) -> tup
 
 SAME = {
     "encoder": ("linear_blocks", "head_channels", "leak", "downsample_blocks"),
-    "decoder": ("local_blocks", "local_channels", "bandwidths", "normals", "surface_bandwidths"),
+    "decoder": ("local_blocks", "local_channels", "bandwidths"),
 }
 
 
