@@ -82,10 +82,9 @@ class LocalLookup(nn.Module):
         constant = jnp.sum((features @ self.left) * (features @ self.right), axis=-2) / 3.0
         count = len(self.bandwidths)
         by_bandwidth = [jnp.split(x, count, axis=-1) for x in (slope, constant)]
-        second = (position[:, :, None] * position[:, None, :]).reshape(-1, 9)
         rows = [
             jnp.concatenate(
-                [s.reshape(len(s), -1), _at_anchors(position, s), c, position, second],
+                [s.reshape(len(s), -1), _at_anchors(position, s), c, moments(position)],
                 axis=-1,
             )
             for s, c in zip(*by_bandwidth, strict=True)
@@ -108,13 +107,10 @@ class LocalLookup(nn.Module):
 
         The second array has what the normals say: no columns where they are not looked up, zeros where none is known.
         """
-        # −|q − x|²/2 up to what is the same for all anchors
-        closeness = jnp.matmul(q, field.position.T, precision="highest") - 0.5 * jnp.sum(
-            field.position**2, axis=-1
-        )
+        near = closeness(q, field.position)
         blended, heights = [], [q[:, :0]]
         for table, bandwidth in zip(field.table, field.bandwidth, strict=True):
-            weight = jax.nn.softmax(closeness / bandwidth**2, axis=-1, where=field.mask)
+            weight = jax.nn.softmax(near / bandwidth**2, axis=-1, where=field.mask)
             # Positions are in the table, and covariances are small differences of their squares.
             mean = jnp.matmul(weight, table, precision="highest")
             blended.append(self._features(q, mean, bandwidth))
@@ -147,6 +143,17 @@ class LocalLookup(nn.Module):
             ],
             axis=-1,
         )
+
+
+def closeness(q: Float[Array, "n 3"], position: Float[Array, "a 3"]) -> Float[Array, "n a"]:
+    """−|q − x|²/2 up to what is the same for all x."""
+    return jnp.matmul(q, position.T, precision="highest") - 0.5 * jnp.sum(position**2, axis=-1)
+
+
+def moments(position: Float[Array, "a 3"]) -> Float[Array, "a 12"]:
+    """Positions, and their products with themselves: blended, they give mean and covariance."""
+    second = (position[:, :, None] * position[:, None, :]).reshape(-1, 9)
+    return jnp.concatenate([position, second], axis=-1)
 
 
 def plane_offsets(

@@ -16,7 +16,9 @@ from jaxtyping import Bool, Float
 
 from more2_jax.network.local_field import (
     NORMAL_FEATURES,
+    closeness,
     length_of,
+    moments,
     plane_features,
     plane_offsets,
     plane_rows,
@@ -67,11 +69,10 @@ class SurfaceLookup(nn.Module):
     def tabulate(self, surface: Anchors, scale: Float[Array, ""]) -> SurfaceField:
         """The points in canonical units."""
         position = surface.offset / scale
-        second = (position[:, :, None] * position[:, None, :]).reshape(-1, 9)
         return SurfaceField(
             position=position,
             mask=surface.mask,
-            moments=jnp.concatenate([position, second], axis=-1),
+            moments=moments(position),
             planes=plane_rows(position, surface.normal),
             bandwidth=jnp.exp(self.log_bandwidth),
             near_plane=jnp.exp(self.log_near_plane),
@@ -79,13 +80,9 @@ class SurfaceLookup(nn.Module):
 
     def query(self, field: SurfaceField, q: Float[Array, "n 3"]) -> Float[Array, "n w"]:
         """Distances for every bandwidth; those by normals are 0 where none is known."""
-        # −|q − x|²/2 up to what is the same for all points
-        closeness = jnp.matmul(q, field.position.T, precision="highest") - 0.5 * jnp.sum(
-            field.position**2, axis=-1
-        )
-        found = []
+        near, found = closeness(q, field.position), []
         for bandwidth in field.bandwidth:
-            weight = jax.nn.softmax(closeness / bandwidth**2, axis=-1, where=field.mask)
+            weight = jax.nn.softmax(near / bandwidth**2, axis=-1, where=field.mask)
             # Covariances are small differences of the moments.
             mean = jnp.matmul(weight, field.moments, precision="highest")
             center, second = mean[:, :3], mean[:, 3:].reshape(-1, 3, 3)

@@ -46,9 +46,10 @@ def decoder_weights(params: Weights, config: PriorConfig, known: Bool[Array, ""]
 
 
 def with_rows_for_normals(bare: Weights, seeing: Weights) -> Weights:
-    """The same distances in the shapes of a decoder that looks up normals: what it reads of them has weights of zero.
+    """The same distances in the shapes of a decoder that looks up more: what it reads of that has weights of zero.
 
-    Rows for normals come last in every kernel, and columns keep their lengths, which weight normalization needs.
+    Rows for normals, then for the surface, come last in every kernel. Columns keep their lengths, which weight
+    normalization needs.
     """
     known: dict[tuple[str, ...], Array] = dict(flatten_dict(bare))  # type: ignore[arg-type]
     wanted: dict[tuple[str, ...], Array] = dict(flatten_dict(seeing))  # type: ignore[arg-type]

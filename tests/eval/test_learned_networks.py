@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from eval.peers.learned import conv_onet, rpmnet
 from eval.peers.learned.clouds import about_vertical, centered, thinned
 from eval.peers.learned.sinkhorn import NONE, sinkhorn
-from eval.peers.learned.vn_dgcnn import VNDGCNN, contrast
+from eval.peers.learned.vn_dgcnn import VNDGCNN
 from eval.peers.learned.vn_onet import VNONet
 from more2_jax.config import EncoderConfig
 
@@ -103,12 +103,6 @@ def test_a_centered_cloud_has_mean_zero_and_radius_one():
     assert np.mean(np.sum(real**2, axis=1)) == pytest.approx(1, abs=1e-5)
     np.testing.assert_allclose(cloud.local(7 * CLOUD[REAL] + 3), real, atol=1e-5)
     assert not np.asarray(cloud.points)[~REAL].any()
-
-
-def test_contrast_is_least_where_each_code_is_nearest_to_its_own():
-    own = jnp.eye(4)
-    right, wrong = (contrast(jnp.stack([own, x], axis=1)) for x in (own, own[::-1]))
-    assert 0 <= float(right) < 1e-4 < 10 < float(wrong)
 
 
 def test_a_plane_that_is_linear_is_looked_up_exactly():

@@ -16,8 +16,7 @@ from more2_jax.network.prior import check_shapes, encode_ordered, init_prior, lo
 from train.run.devices import device_mesh
 from train.run.settings import TrainingRun
 from train.run.shape_mix import load_mix
-from train.run.start import seeing as that_sees
-from train.run.start import started_warm
+from train.run.start import looking_up_more, started_warm
 from train.run.state import initial_state, training_step
 from train.shards.sampling import sample_batch
 
@@ -44,7 +43,7 @@ def prior():
 
 @pytest.fixture(scope="module")
 def seeing(prior):
-    return that_sees(
+    return looking_up_more(
         prior,
         dataclasses.replace(prior.config, decoder=dataclasses.replace(prior.config.decoder, normals=True)),
     )

@@ -27,13 +27,13 @@ def started_cold(settings: TrainingRun, train: ShapeMix, name: str) -> Prior:
 
 
 def started_warm(model: PriorConfig, weights: str, name: str) -> Prior:
-    """Weights that were trained before; of a decoder without normals, with new rows of zeros where it is to see them.
+    """Weights that were trained before; with rows of zeros for what the decoder is to look up and did not.
 
     Raises ValueError if they are not of this model.
     """
     prior = one_decoder(load_prior(weights), model.decoder.normals)
-    if shown(prior, model) != prior.config.decoder:
-        prior = seeing(prior, model)
+    if with_its_look_ups(prior, model) != prior.config.decoder:
+        prior = looking_up_more(prior, model)
     scale = prior.config.encoder.output_scale  # measured at the start of their training, and theirs for good
     wanted = dataclasses.replace(model, encoder=dataclasses.replace(model.encoder, output_scale=scale))
     if different := [
@@ -48,7 +48,7 @@ def started_warm(model: PriorConfig, weights: str, name: str) -> Prior:
     return dataclasses.replace(prior, name=name)
 
 
-def shown(prior: Prior, model: PriorConfig) -> DecoderConfig:
+def with_its_look_ups(prior: Prior, model: PriorConfig) -> DecoderConfig:
     """The settings of the prior's decoder, looking up what `model` looks up besides."""
     own, wanted = prior.config.decoder, model.decoder
     more: dict[str, Any] = {"normals": True} if wanted.normals else {}
@@ -57,9 +57,9 @@ def shown(prior: Prior, model: PriorConfig) -> DecoderConfig:
     return dataclasses.replace(own, **more)
 
 
-def seeing(prior: Prior, model: PriorConfig) -> Prior:
+def looking_up_more(prior: Prior, model: PriorConfig) -> Prior:
     """The same distances from a decoder that looks up more: what it reads of it has weights of zero."""
-    config = dataclasses.replace(prior.config, decoder=shown(prior, model))
+    config = dataclasses.replace(prior.config, decoder=with_its_look_ups(prior, model))
     fresh = init_prior(config, jax.random.key(0)).params["decoder"]
     params = with_rows_for_normals(prior.params["decoder"], fresh)
     return dataclasses.replace(prior, params=prior.params | {"decoder": params}, config=config)

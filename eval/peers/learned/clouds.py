@@ -8,6 +8,7 @@ from functools import partial
 import flax.struct
 import jax
 import jax.numpy as jnp
+import jaxlie
 import numpy as np
 from jax import Array
 from jaxtyping import Bool, Float
@@ -57,12 +58,6 @@ def thinned(
     return points, mask, np.asarray(cloud.origin)
 
 
-def turned_about_vertical(points: Float[Array, "*n 3"], angle: Float[Array, ""]) -> Float[Array, "*n 3"]:
-    """Points turned about z, radians."""
-    return points @ about_vertical(angle).T
-
-
 def about_vertical(angle: Float[Array, ""]) -> Float[Array, "3 3"]:
     """The rotation about z, radians."""
-    c, s, zero = jnp.cos(angle), jnp.sin(angle), jnp.zeros_like(angle)
-    return jnp.stack([c, -s, zero, s, c, zero, zero, zero, jnp.ones_like(angle)]).reshape(3, 3)
+    return jaxlie.SO3.from_z_radians(angle).as_matrix()

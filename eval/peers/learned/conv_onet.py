@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import Any
+from typing import Any, ClassVar
 
 import flax.linen as nn
 import jax
@@ -12,13 +12,12 @@ import optax
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
-from eval.peers.learned.clouds import Centered, turned_about_vertical
-from eval.peers.learned.vn_onet import ResidualBlock
+from eval.peers.learned.clouds import Centered, about_vertical
+from eval.peers.learned.occupancy_network import OccupancyNetwork
 from train.shards.sampling import TrainingSample
 
 CELLS = 32  # a side of a plane; published: 64
 CHANNELS = 16  # of a plane; published: 32
-HIDDEN, BLOCKS = 64, 3  # of the decoder; published: 32, 5
 AXES = ((0, 1), (0, 2), (1, 2))  # of the three planes
 MARGIN = 1.4  # the planes reach this far beyond the cloud's longest half edge: one view shows no back
 FAR = 1e9
@@ -98,21 +97,15 @@ def doubled(planes: Float[Array, "b i j c"]) -> Float[Array, "b 2*i 2*j c"]:
     return jnp.repeat(jnp.repeat(planes, 2, axis=1), 2, axis=2)
 
 
-class ConvONet(nn.Module):
+class ConvONet(OccupancyNetwork):
     """A cloud to a field of occupancy; the planes stand upright, so it is trained on turns about the vertical."""
 
-    def setup(self) -> None:
-        self.points, self.planes = LocalPointNet(), PlaneNet()
-        self.query = nn.Dense(HIDDEN)
-        self.blocks = [ResidualBlock(HIDDEN) for _ in range(BLOCKS)]
-        self.codes = [nn.Dense(HIDDEN) for _ in range(BLOCKS)]
-        self.last = nn.Dense(1)
+    hidden: ClassVar[int] = 64  # published: 32
+    depth: ClassVar[int] = 3  # published: 5
 
-    def __call__(
-        self, points: Float[Array, "n 3"], mask: Bool[Array, " n"], queries: Float[Array, "q 3"]
-    ) -> Float[Array, " q"]:
-        """Logits of being inside, at points of the cloud's frame."""
-        return self.field(self.code(points, mask), queries)
+    def setup(self) -> None:
+        super().setup()
+        self.points, self.planes = LocalPointNet(), PlaneNet()
 
     def code(
         self, points: Float[Array, "n 3"], mask: Bool[Array, " n"]
@@ -130,10 +123,7 @@ class ConvONet(nn.Module):
         planes, cloud = code
         at = cloud.local(queries)
         feature = sum((looked_up(p, at, axes) for p, axes in zip(planes, AXES, strict=True)), jnp.zeros(()))
-        x = self.query(at)
-        for block, own in zip(self.blocks, self.codes, strict=True):
-            x = block(x + own(feature))
-        return self.last(nn.relu(x))[:, 0]
+        return self.decoded(at, feature)
 
 
 def upright_occupancy_loss(
@@ -141,6 +131,7 @@ def upright_occupancy_loss(
 ) -> Float[Array, ""]:
     """Cross-entropy of inside and outside, every shape turned about the vertical by chance."""
     angles = jax.random.uniform(key, (len(sample.points),), maxval=2 * jnp.pi)
-    points, queries = (jax.vmap(turned_about_vertical)(x, angles) for x in (sample.points, sample.queries))
+    R = jax.vmap(about_vertical)(angles)
+    points, queries = (jnp.einsum("bij,bcnj->bcni", R, x) for x in (sample.points, sample.queries))
     logits = jax.vmap(jax.vmap(partial(network.apply, params)))(points, sample.mask, queries)
     return optax.sigmoid_binary_cross_entropy(jnp.asarray(logits), sample.sdf < 0).mean()

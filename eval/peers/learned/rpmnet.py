@@ -17,6 +17,7 @@ from eval.peers.learned.clouds import about_vertical, centered
 from eval.peers.learned.sinkhorn import sinkhorn
 from more2_jax.geometry.points import kabsch
 from more2_jax.network.vector_neurons import nearest_points
+from more2_jax.registration.starting_poses import yaw_of
 from train.shards.sampling import TrainingSample
 
 NEIGHBORS = 12  # published: those within a radius, 64 at most
@@ -134,7 +135,7 @@ def pose(
     share = weight / jnp.maximum(weight.sum(), LEAST)
     mean, meant = share @ source, share @ target
     h = ((source - mean) * share[:, None]).T @ (target - meant)
-    R = about_vertical(jnp.arctan2(h[0, 1] - h[1, 0], h[0, 0] + h[1, 1]))
+    R = about_vertical(yaw_of(h.T))
     top = jnp.concatenate([R, (meant - R @ mean)[:, None]], axis=1)
     return jnp.concatenate([top, jnp.array([[0.0, 0.0, 0.0, 1.0]])])
 

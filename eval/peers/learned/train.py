@@ -95,7 +95,7 @@ def fit(
 ) -> Trained:
     """The peer after a run; what it has learned so far is written to `out` every minute."""
     peer, key = peer_named(name), jax.random.key(seed)
-    state: Any = optimizer(peer.learning_rate).init(params)
+    state: Any = optimizer().init(params)
     losses: list[float] = []
     began = saved = time.process_time()
     while (share := length.share(len(losses), began)) < 1:
@@ -131,10 +131,10 @@ def rate(share: float) -> float:
     return rising * (LAST + (1 - LAST) * 0.5 * (1 + np.cos(np.pi * share)))
 
 
-def optimizer(learning_rate: float) -> optax.GradientTransformation:
-    """Adam with clipped gradients; its rate is set at every step."""
-    return optax.chain(
-        optax.clip_by_global_norm(CLIP), optax.inject_hyperparams(optax.adam)(learning_rate=learning_rate)
+def optimizer() -> optax.GradientTransformation:
+    """Adam with clipped gradients and a rate of 1, which every step multiplies by its own; see `train.run.state`."""
+    return optax.apply_if_finite(
+        optax.chain(optax.clip_by_global_norm(CLIP), optax.scale_by_adam()), max_consecutive_errors=20
     )
 
 
@@ -156,13 +156,11 @@ def step(
     *,
     peer: LearnedPeer,
 ) -> tuple[Params, Any, Float[Array, ""]]:
-    """One step of Adam: parameters, state, loss. A loss or a gradient that is not finite changes nothing."""
+    """One step of Adam: parameters, state, loss. A gradient that is not finite changes nothing."""
     loss, gradient = jax.value_and_grad(lambda p: peer.loss(peer.network, p, sample, key))(params)
-    state[1].hyperparams["learning_rate"] = learning_rate
-    update, after = optimizer(peer.learning_rate).update(gradient, state, params)
-    finite = jnp.isfinite(optax.global_norm(gradient)) & jnp.isfinite(loss)
-    keep = partial(jax.tree.map, partial(jnp.where, finite))
-    return keep(optax.apply_updates(params, update), params), keep(after, state), loss
+    direction, state = optimizer().update(gradient, state, params)
+    update = jax.tree.map(lambda x: -learning_rate * x, direction)
+    return optax.apply_updates(params, update), state, loss
 
 
 if __name__ == "__main__":

@@ -11,7 +11,6 @@ from typing import Any
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
-import optax
 from jax import Array
 from jaxtyping import Bool, Float
 
@@ -19,6 +18,7 @@ from eval.peers.learned.clouds import centered
 from more2_jax.config import EncoderConfig
 from more2_jax.network.encoder import FirstBlock, LinearBlock
 from more2_jax.network.vector_neurons import VNLA, channel_products, kernel_init, linear, masked_mean, norm
+from train.shards.losses import contrast_loss
 from train.shards.sampling import TrainingSample
 
 GRAPH = EncoderConfig(widths=(16, 16, 32, 32), linear_blocks=4, neighbors=8, code=32, points=256)
@@ -80,15 +80,8 @@ class VNDGCNN(nn.Module):
         return x / jnp.sqrt(jnp.sum(x * x) + 1e-12)
 
 
-def contrast(codes: Float[Array, "b 2 code"]) -> Float[Array, ""]:
-    """InfoNCE between two sets of unit codes, both ways: that of row i belongs to row i."""
-    likeness = codes[:, 0] @ codes[:, 1].T / TEMPERATURE
-    own = jnp.arange(len(likeness))
-    both = (optax.softmax_cross_entropy_with_integer_labels(x, own).mean() for x in (likeness, likeness.T))
-    return sum(both, jnp.zeros(())) / 2
-
-
 def matching_loss(network: nn.Module, params: Any, sample: TrainingSample, key: Array) -> Float[Array, ""]:
-    """The contrast of a batch."""
+    """InfoNCE between the two clouds of each shape."""
     codes = jax.vmap(jax.vmap(partial(network.apply, params)))(sample.points, sample.mask)
-    return contrast(jnp.asarray(codes))
+    codes = jnp.asarray(codes)
+    return contrast_loss(codes[:, 0], codes[:, 1], TEMPERATURE)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import Any
+from typing import Any, ClassVar
 
 import flax.linen as nn
 import jax
@@ -13,41 +13,23 @@ from jax import Array
 from jaxtyping import Bool, Float
 
 from eval.peers.learned.clouds import Centered, centered
+from eval.peers.learned.occupancy_network import OccupancyNetwork
 from eval.peers.learned.vn_dgcnn import GRAPH, GraphVectors, Invariants
 from more2_jax.config import EncoderConfig
 from more2_jax.network.vector_neurons import channel_normalize, masked_mean
 from train.shards.sampling import TrainingSample
 
-HIDDEN, BLOCKS = 128, 3  # of the decoder; published: 256, 5
 
-
-class ResidualBlock(nn.Module):
-    """Two layers beside a shortcut (ResnetBlockFC)."""
-
-    hidden: int
-
-    @nn.compact
-    def __call__(self, x: Float[Array, "q h"]) -> Float[Array, "q h"]:
-        return x + nn.Dense(self.hidden)(nn.relu(nn.Dense(self.hidden)(nn.relu(x))))
-
-
-class VNONet(nn.Module):
+class VNONet(OccupancyNetwork):
     """A cloud to a field of occupancy that turns, moves and scales along with it."""
 
     config: EncoderConfig = GRAPH
+    hidden: ClassVar[int] = 128  # published: 256
+    depth: ClassVar[int] = 3  # published: 5
 
     def setup(self) -> None:
+        super().setup()
         self.graph, self.invariants = GraphVectors(self.config), Invariants(self.config.leak)
-        self.query = nn.Dense(HIDDEN)
-        self.blocks = [ResidualBlock(HIDDEN) for _ in range(BLOCKS)]
-        self.codes = [nn.Dense(HIDDEN) for _ in range(BLOCKS)]
-        self.last = nn.Dense(1)
-
-    def __call__(
-        self, points: Float[Array, "n 3"], mask: Bool[Array, " n"], queries: Float[Array, "q 3"]
-    ) -> Float[Array, " q"]:
-        """Logits of being inside, at points of the cloud's frame."""
-        return self.field(self.code(points, mask), queries)
 
     def code(
         self, points: Float[Array, "n 3"], mask: Bool[Array, " n"]
@@ -64,11 +46,7 @@ class VNONet(nn.Module):
         vectors, cloud = code
         at = cloud.local(queries)
         squared = jnp.sum(at**2, axis=-1, keepdims=True)
-        x = self.query(jnp.concatenate([at @ vectors, squared], axis=-1))
-        invariant = self.invariants(vectors)
-        for block, own in zip(self.blocks, self.codes, strict=True):
-            x = block(x + own(invariant))
-        return self.last(nn.relu(x))[:, 0]
+        return self.decoded(jnp.concatenate([at @ vectors, squared], axis=-1), self.invariants(vectors))
 
 
 def occupancy_loss(network: nn.Module, params: Any, sample: TrainingSample, key: Array) -> Float[Array, ""]:
