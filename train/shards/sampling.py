@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float, Int, Int8
 from more2_jax.geometry.points import cleared, farthest_rows
 from more2_jax.types import pytree
 from train.shards.augmentation import (
+    Chance,
     Cloud,
     Kept,
     add_junk,
@@ -23,6 +24,7 @@ from train.shards.augmentation import (
     merge_views,
     start_far_out,
 )
+from train.shards.fusion_flaws import drifted, fused, point_noise
 from train.shards.settings import NORMAL_STEPS, SampleConfig
 from train.shards.shards import Shapes
 
@@ -95,14 +97,15 @@ def partial_cloud(
         keys[1], views, config.max_views, config.raw_points, one_view, config.min_views
     )
     points, lost = depth_noise(keys[2], points, view, config, open_to_flaws * config.depth_noise_probability)
-    points = points + config.noise * jax.random.normal(keys[3], points.shape)
+    points, normals = with_fusion_flaws(key, points, unit(outward[view, place]), view, config, open_to_flaws)
+    points = points + point_noise(keys[3], points, config, open_to_flaws)
     kept = ~lost & ~half_space(keys[4], points, open_to_flaws * config.crop_probability)
     kept &= ~ball(keys[5], points, open_to_flaws * config.ball_probability)
     # A shelf seen edge-on fits into a ball. What is left of it has no size, and the logarithm of its scale no slope.
     kept = jnp.where(kept.sum() < LEAST_KEPT * len(points), True, kept)
     strange = other[0].reshape(-1, 3), unit(other[1]).reshape(-1, 3)
     points, normals, kept = add_junk(
-        keys[6], points, unit(outward[view, place]), kept, strange, open_to_flaws * config.junk_probability
+        keys[6], points, normals, kept, strange, open_to_flaws * config.junk_probability
     )
     # A key of its own: points are what they are without normals.
     normals = flawed_normals(jax.random.fold_in(key, 7), normals, points, config, open_to_flaws)
@@ -110,6 +113,25 @@ def partial_cloud(
     points, normals = cleared(points, kept), cleared(normals, kept)
     index, real = farthest_rows(points, kept, count)
     return points[index], normals[index], real
+
+
+def with_fusion_flaws(
+    key: Array,
+    points: Cloud,
+    normals: Cloud,
+    view: Int[Array, " n"],
+    config: SampleConfig,
+    open_to_flaws: Chance,
+) -> tuple[Cloud, Cloud]:
+    """The flaws of fusion that the settings ask for; keys of their own, so that all else stays what it is."""
+    drift_key, fusion_key = jax.random.fold_in(key, 8), jax.random.fold_in(key, 9)
+    if config.drift_probability > 0:
+        happens = open_to_flaws * config.drift_probability
+        points, normals = drifted(drift_key, points, normals, view, config, happens)
+    if config.fused_probability > 0:
+        happens = open_to_flaws * config.fused_probability
+        points, normals = fused(fusion_key, points, normals, config, happens)
+    return points, normals
 
 
 def unit(steps: Int8[Array, "*n 3"]) -> Float[Array, "*n 3"]:

@@ -17,6 +17,8 @@ class SampleConfig:
     min_views: int = 1  # Fewest depth views that a cloud is merged from.
     max_views: int = 8  # Most of them.
     noise: float = 0.005  # Standard deviation of the points' noise.
+    # If it is above `noise`, clouds open to flaws draw theirs between the two, evenly in the logarithm.
+    most_noise: float = 0.0
     augment_probability: float = 0.6  # Probability of a cloud to be open to the flaws below (as published).
     # Seen from one side alone. This and what follows are shares of the augmented clouds.
     one_view_probability: float = 0.2
@@ -26,6 +28,13 @@ class SampleConfig:
     depth_noise_probability: float = 0.4  # The camera's noise: along the ray, quantized, with lost edges.
     depth_noise: float = 0.002  # Standard deviation of inverse depth, 1 / canonical unit.
     depth_step: float = 0.002  # Step of the quantized inverse depth.
+    drift_probability: float = 0.0  # Each view is shifted and turned, as a hand-held camera's pose drifts.
+    drift: float = 0.015  # Standard deviation of a view's shift, each of three ways; a cloud's own varies.
+    drift_deg: float = 1.0  # The same of its turn.
+    # Surfaces swell, shrink and wave, and edges are rounded, as in fusion on a grid of voxels.
+    fused_probability: float = 0.0
+    fused: float = 0.01  # Standard deviation of the waves along the normal; a cloud's own varies.
+    voxel: float = 0.03  # Side of the cells in which points and normals are averaged; a cloud's own varies.
     # Standard deviation of a normal's tilt, each of two ways; a cloud's own varies.
     normal_noise_deg: float = 10.0
     # Probability of a cloud to have no normals, be it augmented or not.
