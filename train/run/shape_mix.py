@@ -37,12 +37,14 @@ class ShapeMix:
         """The shapes `index`, as NumPy arrays; one after the other, so that no second copy is made."""
         first = np.cumsum([0, *map(len, self.views)])
         rows: dict[str, list[np.ndarray]] = {name: [] for name in MAPPED}
+        scanned = list[bool]()
         for i in index:
             source = int(np.searchsorted(first, i, side="right")) - 1
             stored = self.views[source][i - first[source]]
             for name, kept in rows.items():
                 kept.append(stored[name][: self.queries.get(name)])
-        return Shapes(**{name: np.stack(kept) for name, kept in rows.items()})  # pyright: ignore[reportArgumentType]
+            scanned.append(bool(stored.get("scanned", False)))
+        return Shapes(**{name: np.stack(kept) for name, kept in rows.items()}, scanned=np.array(scanned))  # pyright: ignore[reportArgumentType]
 
 
 def open_mix(sources: Sequence[Path], split: str) -> ShapeMix:
@@ -67,7 +69,7 @@ def open_mix(sources: Sequence[Path], split: str) -> ShapeMix:
 
 def in_memory(shapes: Shapes) -> ShardView:
     """Shapes that are read already, as a view of one shard."""
-    arrays = {name: np.asarray(getattr(shapes, name)) for name in MAPPED}
+    arrays = {name: np.asarray(array) for name, array in vars(shapes).items()}
     rows = tuple((0, k) for k in range(len(arrays["views"])))
     return ShardView(shards=(arrays,), rows=rows, meta=({},) * len(rows))
 

@@ -31,10 +31,13 @@ def from_steps(steps: UInt16[np.ndarray, "..."], levels: int) -> Float[np.ndarra
 
 
 def write_shapes(path: Path, splits: Mapping[str, Mapping[str, np.ndarray]]) -> None:
-    """Writes the arrays `views`, `normals`, `sdf_uniform` and `sdf_near` of every split into one .npz."""
+    """Writes the arrays `views`, `normals`, `sdf_uniform` and `sdf_near` of every split into one .npz.
+
+    And `scanned`, if they have it.
+    """
     stored: dict[str, np.ndarray] = {}
     for split, arrays in splits.items():
-        stored[f"{split}/normals"] = arrays["normals"]
+        stored |= {f"{split}/{name}": arrays[name] for name in ("normals", "scanned") if name in arrays}
         for name, levels in LEVELS.items():
             steps = to_steps(arrays[name], levels)
             stored[f"{split}/{name}/low"] = (steps & 255).astype(np.uint8)
@@ -56,7 +59,8 @@ def read_shapes(path: Path, split: str) -> Shapes:
         raise ValueError(f"{path}: no {split}/{missing[0]}; `python -m train.tools.pack` makes such files")
     read = {name: _array(arrays, f"{split}/{name}", levels) for name, levels in LEVELS.items()}
     normals = arrays.get(f"{split}/normals", np.zeros(read["views"].shape, np.int8))  # zeros: not known
-    return Shapes(**read, normals=normals)  # pyright: ignore[reportArgumentType]
+    scanned = np.asarray(arrays.get(f"{split}/scanned", np.zeros(len(normals))), bool)
+    return Shapes(**read, normals=normals, scanned=scanned)  # pyright: ignore[reportArgumentType]
 
 
 def _array(arrays: Mapping[str, np.ndarray], name: str, levels: int) -> Float[np.ndarray, "..."]:

@@ -70,7 +70,7 @@ def _half_sample(
 ) -> TrainingSample:
     cloud_key, query_key = jax.random.split(key)
     seen = (shapes.views[index], shapes.normals[index]), (shapes.views[other], shapes.normals[other])
-    points, normals, mask = partial_cloud(cloud_key, *seen, config, count)
+    points, normals, mask = partial_cloud(cloud_key, *seen, config, count, shapes.scanned[index])
     queries, sdf = _queries(query_key, shapes, index, config.queries)
     return TrainingSample(points=points, normals=normals, mask=mask, queries=queries, sdf=sdf)
 
@@ -87,18 +87,26 @@ def _queries(
 
 
 def partial_cloud(
-    key: Array, seen: Views, other: Views, config: SampleConfig, count: int
+    key: Array,
+    seen: Views,
+    other: Views,
+    config: SampleConfig,
+    count: int,
+    scanned: Bool[Array, ""] | bool = False,
 ) -> tuple[Cloud, Cloud, Kept]:
-    """A few views merged, noise, then cuts and junk; `count` points in farthest-point order, and their normals."""
+    """A few views merged, noise, then cuts and junk; `count` points in farthest-point order, and their normals.
+
+    Views that are `scanned` have flaws of their own: their points stay as they are.
+    """
     keys, (views, outward) = jax.random.split(key, 7), seen
-    open_to_flaws = jax.random.bernoulli(keys[0], config.augment_probability)
+    open_to_flaws = jax.random.bernoulli(keys[0], config.augment_probability) & ~jnp.asarray(scanned)
     one_view = open_to_flaws * config.one_view_probability
     points, view, place = merge_views(
         keys[1], views, config.max_views, config.raw_points, one_view, config.min_views
     )
     points, lost = depth_noise(keys[2], points, view, config, open_to_flaws * config.depth_noise_probability)
     points, normals = with_fusion_flaws(key, points, unit(outward[view, place]), view, config, open_to_flaws)
-    points = points + point_noise(keys[3], points, config, open_to_flaws)
+    points = points + ~jnp.asarray(scanned) * point_noise(keys[3], points, config, open_to_flaws)
     kept = ~lost & ~half_space(keys[4], points, open_to_flaws * config.crop_probability)
     kept &= ~ball(keys[5], points, open_to_flaws * config.ball_probability)
     # A shelf seen edge-on fits into a ball. What is left of it has no size, and the logarithm of its scale no slope.

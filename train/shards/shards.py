@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jax import Array
-from jaxtyping import Float, Int8
+from jaxtyping import Bool, Float, Int8
 
 from more2_jax.types import pytree
 from train.furniture.packed import read_packed, write_packed
@@ -37,6 +37,7 @@ class Shapes:
     normals: Int8[Array, "shapes views n 3"]  # outward unit normals there, times `NORMAL_STEPS`
     sdf_uniform: Float[Array, "shapes q 4"]  # x y z and signed distance, negative inside
     sdf_near: Float[Array, "shapes q 4"]
+    scanned: Bool[Array, " shapes"]  # views are parts of a scan, with flaws of their own: none are added
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,0 +1,113 @@
+"""Packs masks of simulated scans as training shapes: `python -m train.tools.scanned --rooms rooms/train_mix --out OUT`.
+
+Rooms are of `train.synthesize --regime real`, furnished with training furniture. Every mask is a shape: its views are
+random parts of the mask's points, with the flaws that the scan and the mask have, so that `train.prior` adds none;
+its distances are those of the true, closed model. Beside it, `OUT.credits.tsv` has every model's source and license.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from rich.progress import track
+
+from more2_jax.geometry.poses import Points, apply_pose
+from train.furniture.closed_solids import canonical
+from train.furniture.source_mesh import name_digest
+from train.rooms.scene_files import read_scene
+from train.rooms.visits import FlyingScene, TrueObject
+from train.run.program import run
+from train.shards.packed_shapes import HALF, write_shapes
+from train.shards.settings import NORMAL_STEPS
+from train.shards.signed_distance import signed_distances
+from train.tools.pack import write_credits
+
+FEWEST_POINTS = 100  # of a mask, within the box
+VALIDATION_ROOMS = 10  # one in so many
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sizes:
+    """How much is kept of a mask; all files of one training run agree in the first two."""
+
+    views: int = 12
+    points: int = 256
+    queries: int = 1500
+
+
+def main(rooms: tuple[Path, ...], out: Path, sizes: Sizes = Sizes()) -> None:
+    """Writes one packed file; every tenth room is for validation.
+
+    Args:
+        rooms: folders that `train.synthesize --regime real` wrote.
+        out: the .npz to write.
+        sizes: how much is kept of a mask.
+    """
+    scenes = [s for folder in rooms for s in sorted(folder.glob("scene_????"))]
+    if not scenes:
+        raise ValueError(f"{', '.join(map(str, rooms))}: no scenes; `python -m train.synthesize` makes them")
+    splits: dict[str, list[dict[str, np.ndarray]]] = {"train": [], "val": []}
+    credits: dict[str, dict[str, str]] = {}
+    queries: dict[str, dict[str, np.ndarray]] = {}
+    for n, folder in enumerate(track(scenes, description="rooms")):
+        scene = read_scene(folder)
+        split = "train" if (n + 1) % VALIDATION_ROOMS else "val"
+        for o in scene.objects:
+            known = queries.setdefault(o.model, model_queries(o, sizes.queries))
+            splits[split] += [known | seen for seen in masks_of(scene, o, sizes)]
+            credits[o.model] = {"name": o.model, "source": o.source, "license": o.license}
+    out.parent.mkdir(parents=True, exist_ok=True)
+    write_shapes(out, {split: stacked(rows) for split, rows in splits.items() if rows})
+    write_credits(out.with_suffix(".credits.tsv"), list(credits.values()))
+    counts = ", ".join(f"{len(rows)} {split}" for split, rows in splits.items())
+    print(f"{out}: {counts} masks of {len(credits)} models, {out.stat().st_size / 1e6:.1f} MB")
+
+
+def stacked(rows: Sequence[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
+    """The arrays of `write_shapes`."""
+    arrays = {name: np.stack([r[name] for r in rows]) for name in rows[0]}
+    return arrays | {"scanned": np.ones(len(rows), np.uint8)}
+
+
+def model_queries(o: TrueObject, count: int) -> dict[str, np.ndarray]:
+    """Signed distances of the closed model, canonical units; they depend on it and its name alone."""
+    vertices, _ = canonical(np.asarray(o.vertices, np.float64))
+    rng = np.random.default_rng(name_digest(o.model) % 2**32)
+    uniform, near = signed_distances(vertices, o.faces, rng, count)
+    return {"sdf_uniform": uniform, "sdf_near": near}
+
+
+def masks_of(scene: FlyingScene, o: TrueObject, sizes: Sizes) -> Iterator[dict[str, np.ndarray]]:
+    """Views and normals of each mask that is mostly the object's."""
+    for k, T_scan_model in o.T_scan_model.items():
+        own = set(o.parts.get(k, ())) | {o.instance.get(k, -1)}
+        if k in o.merged:
+            continue
+        for mask in (i for i in scene.scans[k].instances if i.id in own):
+            if mask.normals is not None:
+                points = apply_pose(np.linalg.inv(T_scan_model), np.asarray(mask.points, np.float64))
+                normals = np.asarray(mask.normals, np.float64) @ T_scan_model[:3, :3]
+                yield from views_of(o, points, normals, sizes, name_digest(f"{scene.name} {k} {mask.id}"))
+
+
+def views_of(
+    o: TrueObject, points: Points, normals: Points, sizes: Sizes, seed: int
+) -> Iterator[dict[str, np.ndarray]]:
+    """Random parts of one mask, canonical units of its model; none where too little lies in the box."""
+    _, scale = canonical(np.asarray(o.vertices, np.float64))
+    low, high = o.vertices.min(axis=0), o.vertices.max(axis=0)
+    points = (points - (low + high) / 2) / scale
+    held = np.flatnonzero((np.abs(points) < HALF).all(axis=1))
+    if len(held) < FEWEST_POINTS:
+        return
+    rng = np.random.default_rng(seed % 2**32)
+    rows = np.stack([np.resize(rng.permutation(held), sizes.points) for _ in range(sizes.views)])
+    steps = np.rint(NORMAL_STEPS * normals[rows]).astype(np.int8)
+    yield {"views": points[rows].astype(np.float16), "normals": steps}
+
+
+if __name__ == "__main__":
+    run(main)
