@@ -5,11 +5,11 @@ import json
 import os
 import signal
 import time
-from collections import deque
 
 import psutil
 import pytest
 from command_line import FEW_STEPS, boxes, refused, run_quickly, scan_file
+from inline_team import Inline
 
 from more2_jax import scene
 from more2_jax.cli import batch
@@ -17,34 +17,8 @@ from more2_jax.cli.main import main
 from more2_jax.cli.manifest import RottenRow, SceneJob, read_manifest
 from more2_jax.cli.options import Reading
 from more2_jax.storage.scene_folder import load_scene
-from more2_jax.workers.dealing import Desk
 
 pytestmark = pytest.mark.optimized  # scenes run for longer than their programs compile
-
-
-class Inline:
-    """A team that works in this process, where programs are compiled already."""
-
-    size = 1
-
-    def __init__(self):
-        self.desk, self.having, self.tasks = Desk(batch.SceneMaker()), deque(), []
-
-    def start(self):
-        return 1
-
-    def give(self, worker, task):
-        self.having.append(task)
-        self.tasks.append(task.name)
-
-    def wait(self):
-        return [(1, self.desk.answer(self.having.popleft()))]
-
-    def dismiss(self, worker):
-        pass
-
-    def close(self):
-        pass
 
 
 @pytest.fixture
@@ -143,8 +117,8 @@ def test_what_lies_on_disk_is_kept(place, tiny, inline, capsys):
 @pytest.mark.parametrize("stage", ["add_scan", "reconstruct"])
 def test_what_is_half_done_goes_on_to_the_same_end(place, tiny, inline, capsys, monkeypatch, stage):
     out = place / "all"
+    assert go(written(place, tiny, "two,b.ply;a.ply"), place / "whole") == 0
     path = written(place, tiny, "one,a.ply;b.ply", "two,b.ply;a.ply")
-    assert go(path, place / "whole") == 0
     real, calls = getattr(scene, stage), []
 
     def stopping(*args, **kwargs):

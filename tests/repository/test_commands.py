@@ -4,9 +4,12 @@ import itertools
 import re
 import shlex
 import shutil
+import threading
 from collections.abc import Callable
 from dataclasses import replace
+from http.server import ThreadingHTTPServer
 from pathlib import Path
+from urllib.request import urlopen
 
 import numpy as np
 import pytest
@@ -19,14 +22,16 @@ from dataset_writers.threerscan import write_annotated_mesh, write_semseg
 from factories import living_scene
 from furnished import cabinet, chair, corner
 from guide_pages import blocks, commands, lines
-from places import ROOT
+from inline_team import Inline
+from places import DATA, ROOT
 from scipy.spatial.transform import Rotation
 
 from eval.survival import FEW_STEPS
 from more2_jax.cli.main import main
+from more2_jax.cli.server import address_of, scene_server
 from more2_jax.cli.settings import scene_config
 from more2_jax.config import preset
-from more2_jax.network.prior import save_prior
+from more2_jax.network.prior import load_prior, save_prior
 from more2_jax.report import report_html
 from more2_jax.scans.demo import demo_scan_paths
 from more2_jax.storage.scene_folder import load_scene, save_scene
@@ -123,10 +128,11 @@ def quickly(tmp_path, tiny_prior, monkeypatch):
     few = tmp_path / "few.yaml"
     few.write_text(FEW_STEPS)
     monkeypatch.setattr("more2_jax.network.prior.load_prior", lambda name: replace(tiny_prior, name=name))
-    monkeypatch.setattr(
-        "more2_jax.cli.main.scene_config",
-        lambda name, upright, path, **more: scene_config(name, upright, path or few, **more),
-    )
+    for where in ("main", "manifest"):
+        monkeypatch.setattr(
+            f"more2_jax.cli.{where}.scene_config",
+            lambda name, upright, path, **more: scene_config(name, upright, path or few, **more),
+        )
 
 
 def test_every_block_of_the_page_is_run_here():
@@ -185,9 +191,31 @@ def stored(folder: Path) -> None:
     save_scene(scene, folder, config, page=report_html(scene, config))
 
 
-def test_a_stored_scene_is_shown_and_exported(follow, tmp_path):
+@pytest.fixture
+def visited(monkeypatch):
+    """What a browser gets of `--serve`, by the port of the page; another may be in use on this machine."""
+    seen: dict[int, str] = {}
+
+    def free_port(folder: Path, port: int) -> ThreadingHTTPServer:
+        server = scene_server(folder, 0)
+
+        def look() -> None:
+            with urlopen(address_of(server), timeout=10) as answer:
+                seen[port] = answer.read().decode()
+            server.shutdown()  # as ctrl-C does
+
+        threading.Thread(target=look).start()
+        return server
+
+    monkeypatch.setattr("more2_jax.cli.scenes.scene_server", free_port)
+    return seen
+
+
+def test_a_stored_scene_is_shown_served_and_exported(follow, visited, tmp_path):
     stored(tmp_path / "my_room")
-    follow("\n".join(line for line in more2_of("docs/guides/page.md") if "--serve" not in line))
+    follow("\n".join(more2_of("docs/guides/page.md")))
+    assert list(visited) == [8000]
+    assert "Living scene" in visited[8000]
     follow("\n".join(more2_of("docs/guides/exporting.md")))
     made = {path.suffix for path in tmp_path.iterdir() if path.is_file()}
     assert made == {".glb", ".usda", ".ply", ".json"}
@@ -202,11 +230,66 @@ def test_an_object_is_found_in_other_rooms(follow, tmp_path, capsys):
     assert "object_003" in told
 
 
-def test_settings_and_weights_are_told(follow, tmp_path, capsys):
-    follow("\n".join(more2_of("docs/concepts/prior.md")[:2]))
+def test_settings_and_weights_are_told_and_published_weights_imported(follow, tmp_path, capsys):
+    shutil.copy(DATA / "tiny_checkpoint.pt", tmp_path / "published.pt")
+    shutil.copy(DATA / "tiny_checkpoint_reference.npz", tmp_path / "reference.npz")
+    follow("\n".join(more2_of("docs/concepts/prior.md")))
     follow("more2 settings --preset robust")
     told = capsys.readouterr().out
-    assert "parameters" in told and "memory_mb" in told
+    assert "parameters" in told and "memory_mb" in told and "F_inv" in told
+    assert load_prior(tmp_path / "published.npz").name == "published"
+
+
+def table_of_scenes(folder: Path) -> None:
+    """`scenes.csv` as the page prints it, and the scans that it names."""
+    (text,) = [b for language, b in blocks(DOCS / "guides/many_rooms.md") if b.startswith("name,scans")]
+    (folder / "scenes.csv").write_text(text, encoding="utf-8")
+    labeled_ply(folder)
+    for name in ("kitchen", "office"):
+        for day in ("monday", "friday"):
+            (folder / day).mkdir(exist_ok=True)
+            shutil.copy(folder / f"{day}.ply", folder / day / f"{name}.ply")
+
+
+BATCHES = [
+    line
+    for page in ("many_rooms", "cluster")
+    for line in more2_of(f"docs/guides/{page}.md")
+    if line.startswith("more2 batch")
+]
+
+
+@pytest.mark.no_cover
+def test_a_table_of_scenes_is_built(follow, quickly, tmp_path, monkeypatch, capsys):
+    """By both commands of the guide, here by this process in place of workers and actors."""
+    asked: list[tuple[int | None, str | None]] = []
+
+    def team(workers: int | None, ray: str | None, tasks: int) -> Inline:
+        asked.append((workers, ray))
+        return Inline()
+
+    monkeypatch.setattr("more2_jax.cli.batch.team_of", team)
+    table_of_scenes(tmp_path)
+    follow(BATCHES[0])
+    assert "2 scenes done" in capsys.readouterr().out
+    scenes = [load_scene(tmp_path / "buildings" / name) for name in ("kitchen", "office")]
+    assert [(len(scene.scans), config.preset) for scene, config in scenes] == [(2, "robust"), (2, "paper")]
+    assert scenes[0][1].upright and scenes[1][1].upright
+    follow(BATCHES[1])
+    assert "0 failed" in capsys.readouterr().out
+    assert asked == [(2, None), (None, "HEAD:6379")]
+
+
+@pytest.mark.slow
+def test_a_table_of_scenes_is_built_by_actors(follow, tmp_path, monkeypatch, capsys):
+    """The command of the page word by word, but for the address: a cluster of this machine."""
+    pytest.importorskip("ray", reason="needs the extra `cluster`")
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))  # for the actors
+    monkeypatch.setenv("RAY_worker_niceness", "0")
+    table_of_scenes(tmp_path)
+    follow(BATCHES[1].replace("HEAD:6379", "local"))
+    assert "2 scenes done" in capsys.readouterr().out
+    assert (tmp_path / "buildings/office/report.html").is_file()
 
 
 def test_inspect_prints_what_the_page_of_scans_says(follow, tmp_path, capsys):
