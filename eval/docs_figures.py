@@ -41,6 +41,9 @@ FIGURES = {
     "RE < 5°": ("RE < 5°", "strict"),
     "mean RE": ("mean RE", "strict"),
     "median Chamfer-L1": ("median Chamfer-L1", "strict"),
+    "Chamfer-L1": ("Chamfer-L1", "strict"),
+    "completeness": ("completeness", "strict"),
+    "SDF recall": ("SDF recall, objects", "strict"),
     "IoU": ("IoU", "paper"),
     "time": ("time a scene", ""),
     "time a pair": ("time a pair", ""),
@@ -151,13 +154,25 @@ def of_methods(kept: dict[str, Any], shown: Sequence[str]) -> list[str]:
 
 def of_several(runs: dict[str, dict[str, Any]], shown: Sequence[str]) -> list[str]:
     """A line a run, a column a figure: ours / the best of the others."""
-    lines = [row_of(["run", *shown, "rooms, pairs", "date"]), row_of(["---"] * (len(shown) + 3))]
+    lines = [
+        row_of(["run", *shown, "rooms, pairs" if "recall" in shown else "rooms, objects", "date"]),
+        row_of(["---"] * (len(shown) + 3)),
+    ]
     for name, kept in runs.items():
         cells = [against_best(rows_of(kept, figure)) for figure in shown]
-        pairs = max((r["count"] for r in rows_of(kept, "recall").values()), default=0)
+        counted = rows_of(kept, "recall") or rows_of(kept, shown[0])
+        pairs = max((r["count"] for r in counted.values()), default=0)
         scenes = kept["rows"][0]["scenes"]
         lines.append(row_of([f"`{name}`", *cells, f"{scenes}, {pairs}", kept["date"][:10]]))
-    return lines
+    commands = dict.fromkeys(general(name, kept["command"]) for name, kept in runs.items())
+    return [*lines, "", f"{', '.join(f'`{c}`' for c in commands)}."]
+
+
+def general(name: str, command: str) -> str:
+    """A command with what differs from run to run in capitals."""
+    command = command.replace(f"--out runs/{name}", "--out runs/RUN")
+    command = re.sub(r"(--masks|--scenes) \w+", lambda m: f"{m[1]} {m[1][2:].upper()}", command)
+    return re.sub(r"--data rooms/\w+", "--data rooms/ROOMS", command)
 
 
 def rows_of(kept: dict[str, Any], figure: str) -> dict[str, dict[str, Any]]:

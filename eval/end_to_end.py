@@ -32,7 +32,7 @@ from more2_jax.network.shared_calls import side_by_side
 from more2_jax.scene import add_scan, reconstruct, start_scene
 from more2_jax.types import LivingScene
 
-TEMPORAL = {"t-mAP": "t_map", "t-AP50": "t_ap50", "AP50, scans pooled": "ap50"}  # docs/results/measures.md
+TEMPORAL = {"t-mAP": "t_map", "t-AP50": "t_ap50", "AP50, scans pooled": "ap50"}  # docs/concepts/measures.md
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,7 +1,7 @@
 """Average precision of objects followed over scans, as ReScene4D (arXiv 2601.11508) measures it: t-mAP.
 
 A track is right where it is right in every scan. What is defined there, and what is our reading:
-docs/results/measures.md.
+docs/concepts/measures.md.
 """
 
 from __future__ import annotations

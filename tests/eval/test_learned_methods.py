@@ -191,7 +191,7 @@ def test_few_points_have_no_pose():
 
 @pytest.mark.parametrize("name", ["vn_dgcnn", "vn_onet", "rpmnet"])
 def test_the_page_states_how_shipped_weights_came_about(name):
-    page, of = (ROOT / "docs/results/learned_peers.md").read_text(encoding="utf-8"), load(name)
+    page, of = (ROOT / "docs/concepts/learned_peers.md").read_text(encoding="utf-8"), load(name)
     table = {line.split("|")[1].strip(): line for line in page.splitlines() if line.startswith("| ")}
     assert f"{registry.parameters(of.params):,}" in table["parameters"]
     assert f"{of.training.steps:,}, {of.training.clouds:,}" in table["steps, clouds drawn"]

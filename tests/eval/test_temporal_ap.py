@@ -1,4 +1,4 @@
-"""t-mAP: values by hand, and the laws of its definition (docs/results/measures.md)."""
+"""t-mAP: values by hand, and the laws of its definition (docs/concepts/measures.md)."""
 
 import dataclasses
 

@@ -115,7 +115,8 @@ def census(
     threshold: float,
 ) -> str:
     """The census in Markdown."""
-    lines = ["| source | license | method | train | val | test |", "|---|---|---|---|---|---|"]
+    lines = ["# Census of the training data", "", "Written by `python -m train.tools.census`.", ""]
+    lines += ["| source | license | method | train | val | test |", "|---|---|---|---|---|---|"]
     groups = Counter(
         (m["source"], m.get("license", m.get("licence", "")).split(";")[0][:60], m["method"], m["split"])
         for m in kept
