@@ -25,7 +25,8 @@ from proselint.registry.checks.types import Existence
 from more2_jax.config import from_dict
 
 ROOT = Path(__file__).parents[1]
-# What is no prose: fenced and inline code, comments, tags, addresses of links, front matter.
+# What is no prose: tables that `eval.docs_figures` makes, code, comments, tags, addresses of links, front matter.
+FIGURES = re.compile(r"^<!-- figures: .*?<!-- end of figures -->", re.MULTILINE | re.DOTALL)
 FENCED = re.compile(r"^(`{3,}|~{3,}).*?^\1", re.MULTILINE | re.DOTALL)
 INLINE = re.compile(r"`[^`\n]*(?:\n[^`\n]+)?`")
 NO_PROSE = re.compile(r"<!--.*?-->|<[^>\n]+>|\]\([^)]*\)|https?://\S+|\A---\n.*?\n---\n", re.DOTALL)
@@ -63,7 +64,8 @@ def pages_of(style: Style) -> list[Path]:
 
 def prose_of(text: str) -> str:
     """The text with everything else blanked out, as long as before; a paragraph is one line."""
-    text = FENCED.sub(lambda m: re.sub(r"[^\n]", " ", m[0]), text)
+    for no_prose in (FIGURES, FENCED):
+        text = no_prose.sub(lambda m: re.sub(r"[^\n]", " ", m[0]), text)
     text = INLINE.sub(lambda m: "X" * len(m[0]), text)  # a word each
     text = NO_PROSE.sub(lambda m: re.sub(r"[^\n]", " ", m[0]), text)
     return SOFT_BREAK.sub(" ", text).replace("|", "\n")
