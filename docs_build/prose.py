@@ -32,7 +32,7 @@ INLINE = re.compile(r"`[^`\n]*(?:\n[^`\n]+)?`")
 NO_PROSE = re.compile(r"<!--.*?-->|<[^>\n]+>|\]\([^)]*\)|https?://\S+|\A---\n.*?\n---\n", re.DOTALL)
 # A line break inside a paragraph: what follows is no list, heading, row, quotation, admonition or blank line.
 SOFT_BREAK = re.compile(r"(?<=[^\n])\n(?=[ \t]*[^\s\-*+#|>!\d])|(?<=[^\n])\n(?=[ \t]*\d+[^.\d)])")
-SENTENCE = re.compile(r".+?(?:[.!?](?=\s+[^a-z\s])|$)")
+SENTENCE = re.compile(r".+?(?:[.!?](?=\s+[^a-z\s])|$)", re.MULTILINE)
 WORD = re.compile(r"\w[\w'’/.-]*")
 
 

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from eval.docs_chart import CHART, RUNS, bars_of, draw, plain, shown_in
-from eval.docs_figures import BLOCK, FIGURES, kept_of, main, with_tables
+from eval.docs_chart import CHART, REGISTRATION_CHART, RUNS, bars_of, draw, plain, shares_of, shown_in
+from eval.docs_figures import BLOCK, FIGURES, general, kept_of, main, with_tables
 
 DOCS = Path(__file__).parents[2] / "docs"
 
@@ -86,8 +86,24 @@ def test_ours_is_the_preset_of_the_run_whatever_its_variants_reach(docs):
 
 def test_several_runs_show_ours_beside_the_best_peer(docs):
     made = with_tables(TWO, docs / "figures")
-    assert made.count("| **80.0** / 75.0 | 2.00 / **1.00** | 2, 0 | 2026-11-25 |") == 2
+    assert made.count("| **80.0** / 75.0 | 2.00 / **1.00** | 2, 8 | 2026-11-25 |") == 2
+    assert made.count(f"`{RESULTS['command']}") == 1  # rooms of both have no name of their own
     assert with_tables(made, docs / "figures") == made
+
+
+def test_commands_that_differ_in_names_alone_are_one():
+    first = "python -m eval.end_to_end --data rooms/a --out runs/a_cut --scenes 8 --masks cut"
+    other = "python -m eval.end_to_end --data rooms/b --out runs/b --scenes 16 --masks merged"
+    said = "python -m eval.end_to_end --data rooms/ROOMS --out runs/RUN --scenes SCENES --masks MASKS"
+    assert general("a_cut", first) == general("b", other) == said
+    assert general("c", first) != said  # a folder that is not the run's stays
+
+
+@pytest.mark.no_cover
+def test_the_chart_of_registration_is_of_the_figures_that_are_kept():
+    shares = shares_of(DOCS / "figures")
+    assert shares is not None and shares["upright"]["ours, robust"] > shares["upright"]["multi-start GICP"]
+    assert shown_in(DOCS / REGISTRATION_CHART) == plain(shares), "`python -m eval.docs_figures`"
 
 
 def test_a_page_is_written_and_the_rest_of_it_stays(docs):
