@@ -1,4 +1,9 @@
-"""Living scenes (MoRE², CVPR 2024) in JAX: which object is which, where each moved, one mesh for each."""
+"""Living scenes (MoRE², CVPR 2024) in JAX: which object is which over repeated scans, where each went, and its mesh.
+
+`start_scene`, `add_scan` and `reconstruct` are the whole method; `read_scan`, `load_prior` and `preset` give them what
+they need. The other public names are the stages that these are built of. Lengths are meters; `T_a_b` takes points of
+frame b to frame a.
+"""
 
 from __future__ import annotations
 

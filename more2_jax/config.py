@@ -1,4 +1,4 @@
-"""Settings: one small frozen dataclass a stage, two presets, strict YAML."""
+"""Settings: one small frozen dataclass for each stage, three presets, strict YAML."""
 
 from __future__ import annotations
 
@@ -233,7 +233,7 @@ class PoseGraphConfig:
 
 @dataclass(frozen=True)
 class SceneConfig:
-    """The whole method; `preset('paper')` follows the paper, `preset('robust')` is the default."""
+    """Settings of the whole method; `preset('robust')` is the default, `preset('paper')` follows the paper."""
 
     preset: str = "paper"  # Whose settings these are, or began as.
     # Objects turn about the vertical (z) only. None: they do where the first scan shows a level floor.

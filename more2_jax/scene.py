@@ -57,19 +57,19 @@ from more2_jax.types import (
     Skipped,
 )
 
-# Masks, objects and instances as they were compared, who is who.
+# Regrouped masks, objects and instances as matching compared them, and the matches.
 Compared = tuple[Regrouped, list[tuple[ObservedObject, Pose]], list[ObservedObject], Identified]
 
-CLOSED_AT_ONCE = 64  # objects whose poses are refined at a time: what they take beside the scene, a MB each
-BACKGROUND_POINTS = 20_000  # of a scan, remembered for the page and for what its sensors looked through
+CLOSED_AT_ONCE = 64  # objects whose poses are refined in one call; each takes a MB
+BACKGROUND_POINTS = 20_000  # of a scan, kept for the page and for free space
 
 
 def start_scene(
     prior: Prior, scan: Scan, config: SceneConfig, *, progress: Watcher | None = None
 ) -> LivingScene:
-    """The living scene of one scan: every instance is an object, seen once. Raises ValueError if there is none.
+    """Returns the living scene of one scan: every instance becomes an object. Raises ValueError if there is none.
 
-    `progress` is told of every stage, here and below.
+    `progress` is called with an event of every stage, here and in the functions below.
     """
     config = settled(config, shows_floor(scan) if config.upright is None else config.upright)
     level, T_level_scan = leveled_scan(scan, config)
@@ -99,7 +99,10 @@ def who_is_who(
     config: SceneConfig,
     stage: Callable[[str, int], AbstractContextManager[Any]],
 ) -> Compared:
-    """The objects and a scan's instances, parts joined, masks of two divided; both as compared; who is who."""
+    """Matches instances to objects. Masks in parts are joined first, and masks over two objects divided.
+
+    Returns the regrouped masks, objects and instances as matching compared them, and the matches.
+    """
     with stage("encode", len(instances)):
         embeddings = embed(prior, [i.points for i in instances], [i.normals for i in instances])
     masks = Regrouped(objects=list(scene.objects), instances=list(instances), embeddings=embeddings)
@@ -124,10 +127,10 @@ def who_is_who(
 def add_scan(
     prior: Prior, scene: LivingScene, scan: Scan, config: SceneConfig, *, progress: Watcher | None = None
 ) -> LivingScene:
-    """Matches a new scan's instances to the scene's objects, registers every pair in one call, notes what changed.
+    """Adds a scan: matches its instances to the scene's objects, registers the pairs, and notes what changed.
 
-    Objects that were absent for a while can come back. Meshes of objects seen again are dropped; `reconstruct`
-    makes them anew. Raises ValueError if the scan has no usable instance.
+    An object that was absent from earlier scans can come back. Meshes of objects that were seen again are dropped,
+    and `reconstruct` makes new ones. Raises ValueError if the scan has no usable instance.
     """
     config, scene = settled(config, scene.upright), readable(prior, scene)
     level, T_level_scan = leveled_scan(scan, config, scene.scans[0])
@@ -169,7 +172,7 @@ def chances(
     fresh: Mapping[int, SceneObject],
     config: SceneConfig,
 ) -> dict[str, float]:
-    """By id, how likely it is that what is gone is gone, that what came back is what it was, that what is new is new.
+    """Returns by object id the probability that it is really gone, back or new.
 
     `fresh`: new objects by the rows of their instances.
     """
@@ -182,12 +185,12 @@ def chances(
 def reconstruct(
     prior: Prior, scene: LivingScene, config: SceneConfig, *, progress: Watcher | None = None
 ) -> LivingScene:
-    """Poses of objects seen more than once are made to agree, or optimized with the code; then meshes are extracted.
+    """Refines the poses of objects that were seen more than once, then extracts the mesh of every object.
 
-    `pose_graph.steps` (`robust`): all observations of an object are aligned with one another at once. Codes become
-    those of all observations together (paper §3.4) where `accumulate_target` has not made them so before. `joint.steps`
-    (`paper`): code and poses of all objects are optimized in one call (§3.5). Observations in doubt
-    (`Observation.accumulated` False) have no part in it. Objects with a mesh have not changed since and are left alone.
+    `pose_graph.steps` (preset `robust`) aligns all observations of an object with one another. `joint.steps` (preset
+    `paper`) optimizes code and poses together (paper §3.5). An object without a code of all its observations is
+    encoded anew (§3.4). Doubtful observations (`Observation.accumulated` False) are left out. Objects that have a
+    mesh are not touched: they have not changed since it was made.
     """
     config, scene = settled(config, scene.upright), readable(prior, scene)
     timing, objects = dict(scene.timing_s), list(scene.objects)
@@ -226,11 +229,11 @@ def run_scenes(
     meshes: bool = True,
     at_once: int | None = None,
 ) -> list[LivingScene]:
-    """The living scene of each scene's scans in turn, reconstructed unless `meshes` is False: many at the same time.
+    """Builds many living scenes side by side, each from a list of scans in time order.
 
-    As one at a time to rounding. Compiled calls take rows of several scenes (`network.shared_calls`); `at_once` scenes
-    work between them, by default as many as there are cores. Raises ValueError where a scene has no scan, or its scans
-    raise one, when all others are done.
+    Results equal those of one scene at a time, to rounding. Compiled calls are filled with rows of several scenes
+    (`network.shared_calls`). `at_once` scenes run between these calls, by default one a core. `meshes` False leaves
+    `reconstruct` out. A scene that fails raises its ValueError after all others are done.
     """
 
     def one(scans: Sequence[Scan]) -> LivingScene:
@@ -251,7 +254,7 @@ def compared_objects(
     scan: Scan,
     config: SceneConfig,
 ) -> tuple[list[tuple[ObservedObject, Pose]], list[ObservedObject]]:
-    """The objects (scene's frame, each with the pose to its own) and a scan's instances, as stages take them."""
+    """Returns objects (in the scene's frame, with the pose to their own) and instances as the stages take them."""
     of_objects = object_sights(scene.objects, scene.scans)
     of_instances = instance_sights(instances, scan, remembered(scan.background))
     near, beside = surroundings_where_masks_may_be_wrong(scene, instances, scan, config)
@@ -274,7 +277,7 @@ def compared_objects(
 
 
 def usable(scan: Scan, config: SceneConfig) -> tuple[list[Instance], tuple[Skipped, ...]]:
-    """The instances with enough points, and what is left out; ValueError if nothing remains."""
+    """Returns the instances with enough points, and what is left out. Raises ValueError if nothing remains."""
     need = config.min_points
     small = [i for i in scan.instances if len(i.points) < need]
     skipped = tuple(
@@ -288,7 +291,7 @@ def usable(scan: Scan, config: SceneConfig) -> tuple[list[Instance], tuple[Skipp
 def surroundings_where_masks_may_be_wrong(
     scene: LivingScene, instances: Sequence[Instance], scan: Scan, config: SceneConfig
 ) -> tuple[Sequence[Points | None], Sequence[Points | None]]:
-    """What lies around the objects (each in its own frame) and around a scan's instances, unless masks are kept."""
+    """Returns the points around each object (in its own frame) and around each instance; None if masks are kept."""
     if not config.repair_masks:
         return [None] * len(scene.objects), [None] * len(instances)
     background = remembered(scan.background)
@@ -299,7 +302,7 @@ def surroundings_where_masks_may_be_wrong(
 
 
 def without_floor_and_walls(instances: list[Instance], scan: Scan, config: SceneConfig) -> Cleared:
-    """The instances without points that are floor or wall, where masks are mended."""
+    """Returns the instances without their points of floor or wall, if masks are repaired."""
     if not config.repair_masks:
         return Cleared(instances=instances)
     return without_room(instances, remembered(scan.background), config.min_points)
@@ -308,7 +311,7 @@ def without_floor_and_walls(instances: list[Instance], scan: Scan, config: Scene
 def with_borders_mended(
     objects: list[SceneObject], found: Sequence[Found], scene: LivingScene, scan: Scan, config: SceneConfig
 ) -> tuple[list[SceneObject], tuple[Repair, ...]]:
-    """The objects with the borders of what the scans saw of them mended, where masks are. `scan`: new, leveled."""
+    """Returns the objects with the borders of their masks repaired. `scan`: the new one, leveled."""
     if not config.repair_masks:
         return objects, ()
     index = len(scene.scans)
@@ -317,12 +320,12 @@ def with_borders_mended(
 
 
 def settled(config: SceneConfig, upright: bool) -> SceneConfig:
-    """The settings of a scene whose first scan has said whether things stay upright, where they leave it open."""
+    """Returns the settings with `upright` filled in, if they leave it to the first scan."""
     return dataclasses.replace(config, upright=upright) if config.upright is None else config
 
 
 def leveled_scan(scan: Scan, config: SceneConfig, first: ScanRecord | None = None) -> tuple[Scan, Pose]:
-    """The scan, leveled if its z is up, and T_level_scan. `first`: scan of the scene, if it has begun."""
+    """Returns the scan, leveled if the scene is upright, and T_level_scan. `first`: the scene's first scan."""
     if not config.upright:
         return scan, np.eye(4)
     T_level_first = None if first is None else first.frame.T_scene_scan
@@ -331,7 +334,7 @@ def leveled_scan(scan: Scan, config: SceneConfig, first: ScanRecord | None = Non
 
 
 def rooms_of(scene: LivingScene, scan: Scan) -> Rooms:
-    """The background of the scan before and of a new one, leveled."""
+    """Returns the backgrounds of the scene's last scan and of a new one, both leveled."""
     last = scene.scans[-1]
     return Rooms(scene=apply_pose(last.frame.T_scene_scan, last.background), scan=scan.background)
 
@@ -361,5 +364,5 @@ def record(
 
 
 def remembered(background: Float[np.ndarray, "b 3"]) -> Float[np.ndarray, "k 3"]:
-    """Of what is no instance, points at even steps, `BACKGROUND_POINTS` at most."""
+    """Returns every k-th point of the background, so that at most `BACKGROUND_POINTS` remain."""
     return background[:: max(1, -(-len(background) // BACKGROUND_POINTS))]

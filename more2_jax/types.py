@@ -66,8 +66,8 @@ def pytree(cls: type[T]) -> type[T]:
 class PointCloud:
     """A padded point cloud; rows where `mask` is False carry no meaning.
 
-    `points` are meters relative to `origin`, which stays float64 on the host: an object surveyed a
-    kilometer from the world's zero keeps its micrometers in float32. Inside compiled programs it is None.
+    `points` are meters relative to `origin`, which stays float64 on the host. So an object a kilometer from
+    zero keeps its precision in float32. Inside compiled programs `origin` is None.
     """
 
     points: Float[Array, "*batch n 3"] = quantity("position")  # meters, relative to `origin`
@@ -134,7 +134,7 @@ class Embedding:
 
 @pytree
 class LocalBatch:
-    """Objects side by side, each in a local frame about its own `origin`, which stays float64 on the host.
+    """A batch of objects, each in a local frame about its own `origin`, which stays float64 on the host.
 
     `cloud` and `code` are relative to `origin` and have none of their own.
     """
@@ -224,7 +224,7 @@ class Instance:
 
 @dataclass(frozen=True, kw_only=True)
 class ObservedObject:
-    """An object as the stages compare it: all that was seen of it, in one frame."""
+    """An object as matching and registration take it: all that was seen of it, in one frame."""
 
     points: Float[np.ndarray, "_ 3"] = quantity("position")  # meters, float64
     embedding: Embedding = quantity("record")  # NumPy leaves, unbatched
@@ -265,7 +265,7 @@ class Skipped:
 
 @dataclass(frozen=True, kw_only=True)
 class Scan:
-    """One visit to the place: instances and what was ignored."""
+    """One visit to the place: its instances, its background, and what was ignored."""
 
     name: str
     source: str

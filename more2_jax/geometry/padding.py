@@ -29,8 +29,8 @@ def pad_clouds(
 ) -> PointCloud:
     """Batches ragged clouds: (objects, bucket, 3), centered on each cloud's own `origin` (float64).
 
-    The point farthest from the mean comes first: farthest-point sampling starts there, so that the order of
-    a cloud's points does not matter. Clouds beyond `MAX_POINTS` are thinned evenly by index. `size` sets the
+    The point farthest from the mean comes first. Farthest-point sampling starts there, so the order of a cloud's
+    points does not matter. Clouds beyond `MAX_POINTS` are thinned evenly by index. `size` sets the
     bucket. `normals`: the points' unit normals, outward; None for a cloud, or zeros for a point, where not known.
     Raises ValueError on an empty list, a shape that is not (n, 3), no points, points that are not finite, and normals
     that are not as many as the points.

@@ -64,11 +64,11 @@ def extract_mesh(
 ) -> Mesh | None:
     """A level set of one object's field, by default 0; meters in its scan's frame, always closed (paper §3.4).
 
-    `half_width` (canonical units) is half the edge of the query box. With `seen`, points of the surface in the
-    scan's frame, and a `config.mls_bandwidth`, the surface runs through them; each was seen from one of the sensor
-    positions `seen_from` (NaN fills up), if they are known, and faces along `normals` (zeros where not known). Nothing
-    lies below the height `floor`. Returns None when the field stays above `level` in the box: there is no surface to
-    show. Raises ValueError unless `resolution` is `coarse_resolution` doubled some times.
+    `half_width` (canonical units) is half the edge of the query box. `seen` are points of the surface in the scan's
+    frame; with a `config.mls_bandwidth` the surface runs through them. `seen_from` are the sensor positions that each
+    was seen from, if known (NaN fills up), and `normals` where it faces (zeros if not known). Nothing lies below the
+    height `floor`. Returns None if the field stays above `level` in the box. Raises ValueError unless `resolution` is
+    `coarse_resolution` times a power of two.
     """
     _check(config)
     lowest = lowest_height(embedding, floor)

@@ -32,7 +32,7 @@ FORMAT = 1  # of weight files
 
 @pytree
 class Prior:
-    """Frozen weights and the settings they belong to."""
+    """Trained weights of encoder and decoder, and their settings."""
 
     params: dict[str, Any]
     config: PriorConfig = flax.struct.field(pytree_node=False)
@@ -154,10 +154,10 @@ def _encode_many(
 def encode(prior: Prior, cloud: PointCloud) -> Embedding:
     """Encodes a batch of clouds (from `pad_clouds`): Φ(sRX + t) = (F_inv, R·F_eqv, s·F_s, sR·F_c + t), paper §3.1.
 
-    Returns a batch of embeddings whose `center` is in meters relative to `origin`, which is the cloud's. Points, mask
-    and weights may be traced: a mask is then taken as it is. The cloud's normals go along with the anchors; the four
-    codes are of the positions alone. Raises ValueError for points that are no batch of clouds, a mask or normals of
-    another shape, and a cloud that is known to have no real point.
+    Returns a batch of embeddings. `center` is in meters relative to `origin`, which is the cloud's. Points, mask
+    and weights may be traced. Normals go to the decoder with the anchors; the four codes depend on positions alone.
+    Raises ValueError for points that are no batch of clouds, a mask or normals of another shape, and a cloud that
+    is known to have no real point.
     """
     points, mask = cloud.points, cloud.mask
     if points.ndim != 3 or points.shape[-1] != 3:
@@ -212,10 +212,9 @@ def sdf(
 ) -> Float[Array, "b n"]:
     """Signed distances of a batch of objects at points in each scan's frame (meters), canonical units.
 
-    Multiply by `embedding.scale` for meters; negative inside (paper §3.1). Points, embedding and weights may be traced.
-    Points are moved to the embedding's origin in the precision they come in (float64 where both lie on the host), then
-    asked in the embedding's. Raises ValueError on shapes that differ, and on embeddings that the decoder cannot be
-    asked about.
+    Negative inside (paper §3.1); multiply by `embedding.scale` for meters. Points, embedding and weights may be traced.
+    Points are shifted to the embedding's origin in their own precision (float64 on the host), then evaluated in the
+    embedding's. Raises ValueError on shapes that differ, and on embeddings that the decoder does not take.
     """
     check_embedding(prior, embedding, "sdf")
     if points.ndim != 3 or points.shape[-1] != 3 or points.shape[:1] != embedding.scale.shape:

@@ -56,10 +56,10 @@ def pair_up(
     T_target_source: Float[np.ndarray, "4 4"] | Float[np.ndarray, "b 4 4"] | None = None,
     candidates: jaxlie.SE3 | None = None,
 ) -> PairBatch:
-    """Row i of `source` with row i of `target`.
+    """Pairs row i of `source` with row i of `target`.
 
-    `T_target_source`: how the source's scan lies in the target's frame, so where an object is that did not move; by
-    default both scans share a frame. `candidates` (b, k) are local poses. Raises ValueError when the batches differ.
+    `T_target_source` is the pose of the source's scan in the target's frame, so that of an object that did not move;
+    by default both scans share a frame. `candidates` (b, k) are local poses. Raises ValueError if the batches differ.
     """
     sizes = [len(x) for side in (source, target) for x in (side.cloud.points, side.code.scale)]
     if len(set(sizes)) != 1:
@@ -123,7 +123,7 @@ def padded_around(
 
 
 def observe(prior: Prior, clouds: Sequence[Float[np.ndarray, "_ 3"]]) -> LocalBatch:
-    """Clouds in their scans' frames (meters) as one batch of objects, padded and encoded (paper §3.1).
+    """Pads and encodes clouds (meters, in their scans' frames) as one batch of objects (paper §3.1).
 
     Raises ValueError as `pad_clouds` does.
     """
@@ -132,7 +132,7 @@ def observe(prior: Prior, clouds: Sequence[Float[np.ndarray, "_ 3"]]) -> LocalBa
 
 
 def batch_of(cloud: PointCloud, code: Embedding, sight: Sight | None = None) -> LocalBatch:
-    """Clouds and their codes about the clouds' origins; `sight` (from `padded_sights`) is about them already."""
+    """Clouds and their codes as one batch about the clouds' origins, as `sight` (from `padded_sights`) is already."""
     return LocalBatch(
         cloud=dataclasses.replace(cloud, origin=None),
         code=about(code, cloud.origin),

@@ -41,8 +41,8 @@ def register(
 ) -> Registration:
     """Registers row i of `pairs.source` onto row i of `pairs.target` (paper §3.3), all in compiled batches.
 
-    Refines `pairs.candidates`, or looks for poses itself where there are none. `motion` "upright": shifts and turns
-    about the vertical only. Works under `jax.jit` (of which `motion`, if it is given, is a static argument),
+    Refines `pairs.candidates`, or searches for poses itself if there are none. `motion` "upright" allows shifts and
+    turns about the vertical only. Works under `jax.jit` (of which `motion`, if it is given, is a static argument),
     `jax.vmap`, `jax.grad` and `jax.jvp`. Raises ValueError when the
     decoder cannot be asked about the codes: those of another encoder need a `SurfaceRegistration` whose
     `search.field_weight` is 0.

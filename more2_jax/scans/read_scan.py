@@ -41,16 +41,17 @@ def read_scan(
 ) -> Scan:
     """Reads one scan: instances in meters (float64, the scan's own frame), and what was left out.
 
-    `path` is a PLY whose vertices carry an integer property naming the instance (`instance`, `instance_id`,
-    `objectId`, `object_id` or `label`, in this order; `instance_property` names another), an NPZ with `points` (n,
-    3), `instance` (n,) and optional `label` (n,), `color` or `colors` (n, 3), `normal` or `normals` (n, 3),
-    `sensors` (s, 3), a folder of one PLY per object, or another of `data.formats.registry`. `<scan>.sensors.txt`
-    beside it may hold the places of its sensors. Instance ids ≤ 0 are background. `unit` is the file's: m, cm or
-    mm. Instances of fewer than `min_points` points are reported in `Scan.skipped`; sizes that look like another
-    unit, in `Scan.warnings`. `masks` are predicted ones (`data.masks`): those scored `min_score` or more replace
-    the scan's own. `segment="geometric"` cuts a cloud without instances into planes and clusters; `depth_frames`
-    reads the raw depth of 3RScan (paper §4). Normals are the file's, else those of its faces. `up` names the axis
-    that is up in the file (x, y, z, -x, -y, -z): the scan is turned so that it is z.
+    `path` is a PLY whose vertices have an integer property naming the instance (`instance`, `instance_id`, `objectId`,
+    `object_id` or `label`, in this order; `instance_property` names another); an NPZ with `points` (n, 3), `instance`
+    (n,) and optional `label` (n,), `color` or `colors` (n, 3), `normal` or `normals` (n, 3), `sensors` (s, 3); a folder
+    of one PLY per object; or another format of `scans.formats.registry`. `<scan>.sensors.txt` beside it may hold the
+    positions of its sensors. Instance ids ≤ 0 are background. Normals are the file's, else those of its faces.
+
+    `unit` is the file's: m, cm or mm. `up` names the file's up axis (x, y, z, -x, -y, -z); the scan is turned so that
+    it is z. `masks` are predicted ones (`scans.predicted_masks`): those scored `min_score` or more replace the scan's
+    own. `segment="geometric"` cuts a cloud without instances into planes and clusters. `depth_frames` reads the raw
+    depth of 3RScan (paper §4). Instances of fewer than `min_points` points are named in `Scan.skipped`, sizes that look
+    like another unit in `Scan.warnings`.
 
     Raises ValueError, in one line, when the file is missing, unknown, damaged, has no instance property, has
     coordinates that are not finite, or no instance is left.
