@@ -46,7 +46,9 @@ def kept_of(figures: Path, names: tuple[str, ...]) -> list[dict[str, Any]] | Non
 def bars_of(figures: Path) -> Bars | None:
     """What the chart of the README shows, in percent; None where a run is not kept."""
     kept = kept_of(figures, tuple(RUNS))
-    return kept and {figure: [pair_of(run, figure) for run in kept] for figure in SHOWN}
+    if not kept:
+        return None
+    return {figure: [pair_of(run, figure) for run in kept] for figure in SHOWN}
 
 
 def pair_of(kept: dict[str, Any], figure: str) -> tuple[float, float]:

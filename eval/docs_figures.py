@@ -115,7 +115,7 @@ def table_of(what: str, figures: Path) -> str:
     if len(runs) > 1:
         lines = of_several(runs, shown)
     elif asked.get("lines") == "methods":
-        lines = of_methods(runs[names[0]], shown)
+        lines = of_methods(runs[names[0]], shown, asked.get("only", ""))
     else:
         lines = of_one(runs[names[0]], shown)
     return "\n".join(lines) + "\n"
@@ -135,8 +135,8 @@ def of_one(kept: dict[str, Any], shown: Sequence[str]) -> list[str]:
     return [*lines, "", f"`{kept['command']}`, {date}, {kept['rows'][0]['scenes']} rooms."]
 
 
-def of_methods(kept: dict[str, Any], shown: Sequence[str]) -> list[str]:
-    """A line a method, with intervals; a column a figure."""
+def of_methods(kept: dict[str, Any], shown: Sequence[str], only: str = "") -> list[str]:
+    """A line a method, with intervals; a column a figure. `only`: methods whose names begin so."""
     tables = {figure: rows_of(kept, figure) for figure in shown}
     best = {f: max(map(worth, rows.values())) for f, rows in tables.items()}
     units = {f: next(iter(rows.values()))["unit"] for f, rows in tables.items()}
@@ -144,7 +144,7 @@ def of_methods(kept: dict[str, Any], shown: Sequence[str]) -> list[str]:
         row_of(["", *(f"{f} [{unit}]" for f, unit in units.items())]),
         row_of(["---"] * (len(shown) + 1)),
     ]
-    for method in dict.fromkeys(r["method"] for r in kept["rows"]):
+    for method in dict.fromkeys(r["method"] for r in kept["rows"] if r["method"].startswith(only)):
         found = [(rows.get(method), best[f]) for f, rows in tables.items()]
         cells = [cell(r, worth(r) >= most) if r else "" for r, most in found]
         lines.append(row_of([method, *cells]))
@@ -198,7 +198,9 @@ def worth(row: dict[str, Any]) -> float:
 def cell(row: dict[str, Any], best: bool) -> str:
     """A figure, its interval, and in how many cases there is none."""
     text = bold(number(row["value"]), best)
-    if row["ci95"]:
+    if (
+        row["ci95"] and row["unit"] != "s"
+    ):  # times differ with what else a machine does, more than between rooms
         text += f" ({number(row['ci95'][0])} to {number(row['ci95'][1])})"
     return text + (f"; {row['failures']} failed" if row["failures"] else "")
 

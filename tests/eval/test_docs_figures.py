@@ -73,6 +73,8 @@ def test_one_run_of_many_methods_has_a_line_a_method(docs):
     made = with_tables(ONE.replace("median RE", "median RE; lines = methods"), docs / "figures")
     assert "| ours, robust | **80.0** (79.0 to 81.0) | 2.00 (1.00 to 3.00) |" in made
     assert "| RANSAC | 75.0 (74.0 to 76.0) |  |" in made and "| GICP | 70.0" in made
+    ours = with_tables(ONE.replace("median RE", "median RE; lines = methods; only = ours"), docs / "figures")
+    assert "| ours, robust | **80.0**" in ours and "GICP" not in ours
 
 
 def test_ours_is_the_preset_of_the_run_whatever_its_variants_reach(docs):
