@@ -20,12 +20,12 @@ class EncoderConfig:
 
     widths: tuple[int, ...] = (32, 32, 64, 64, 128, 256, 512)  # Channels of every block.
     code: int = 256  # Channels of F_inv, and vectors of F_eqv.
-    neighbors: int = 16  # Nearest points that a point looks at, in feature space.
+    neighbors: int = 16  # Nearest neighbors of a point, in feature space.
     linear_blocks: int = 2  # The first blocks have no attention.
     head_channels: int = 16  # Channels of one head of attention.
-    # The points are thinned on entering these blocks, counted from 0.
+    # The points are thinned before these blocks, counted from 0.
     downsample_blocks: tuple[int, ...] = (2, 4, 5)
-    downsample_factors: tuple[int, ...] = (2, 4, 4)  # One point of so many stays, at each of them.
+    downsample_factors: tuple[int, ...] = (2, 4, 4)  # One point in this many stays, at each of them.
     leak: float = 0.2  # Slope of the leaky ReLU.
     # F_s and F_c are in units of this, chosen so that F_s is about 1 at step 0.
     output_scale: float = 64000.0
@@ -37,10 +37,10 @@ class DecoderConfig:
     """Decoder Ψ (paper §3.1), a DeepSDF network."""
 
     hidden: int = 768  # Width of the hidden layers.
-    layers: int = 8  # How many hidden layers there are.
+    layers: int = 8  # Number of hidden layers.
     skip_layer: int = 4  # The input is concatenated before this layer, counted from 0.
     dropout: float = 0.2  # Share of a layer's outputs that are dropped while training.
-    # As published: the layer before gives way, so that the skip layer sees `hidden` numbers.
+    # As published: the layer before the skip is narrower, so that the skip layer has `hidden` inputs.
     narrow_skip: bool = True
     # The decoder looks up points and features of these encoder blocks, counted from 0.
     local_blocks: tuple[int, ...] = ()
@@ -48,7 +48,7 @@ class DecoderConfig:
     # Widths of the look-up when training starts, canonical units.
     bandwidths: tuple[float, ...] = (0.05, 0.15)
     normals: bool = False  # The anchors' normals are looked up too, where they are known.
-    # Beside them this many observed points are looked up, with their normals and without features.
+    # Observed points that are looked up beside the anchors, with their normals and without features.
     surface_points: int = 0
     # Widths of that look-up when training starts, canonical units.
     surface_bandwidths: tuple[float, ...] = (0.02, 0.04, 0.08, 0.16)
@@ -62,12 +62,12 @@ class PriorConfig:
     decoder: DecoderConfig = field(default_factory=DecoderConfig)
     eqv_gain: float = 1.0  # F_eqv is multiplied by this for the decoder.
     inv_gain: float = 1.0  # F_inv is multiplied by this for the decoder.
-    bare_decoder: bool = False  # Whether a second decoder answers for objects of which no normal is known.
+    bare_decoder: bool = False  # Whether a second decoder serves objects without normals.
 
 
 @dataclass(frozen=True)
 class SurfaceSearch:
-    """How a pair's poses are searched: every start aligned by coarse surfaces, the few that fit best kept.
+    """The search for a pair's poses: every start is aligned on coarse surfaces, and the few that fit best are kept.
 
     Lengths are shares of the target cloud's radius unless a name says otherwise. What each is worth:
     docs/developing/notebook/registration_parts.md.
@@ -75,18 +75,18 @@ class SurfaceSearch:
 
     # Starts about the vertical, if upright. In any orientation the 60 rotations of an icosahedron are tried.
     turns: int = 24
-    points: int = 128  # So many points of either cloud are compared with the other.
-    dense: int = 1024  # So many points of the other are found by a table.
-    cells: int = 24  # The table has so many cells a side.
-    steps: int = 12  # Every start is aligned by so many steps.
-    first_reach: float = 0.3  # In the first step, correspondences this far apart count a quarter.
-    last_reach: float = 0.1  # In the last step, these do.
-    keep: int = 6  # So many poses are kept, each turned otherwise.
-    truncation: float = 0.2  # A point farther from the other cloud counts as this far.
+    points: int = 128  # Points of each cloud that are compared with the other.
+    dense: int = 1024  # Points of the other cloud, found through a table.
+    cells: int = 24  # Cells of the table along each side.
+    steps: int = 12  # Steps that align every start.
+    first_reach: float = 0.3  # Distance at which a correspondence counts a quarter in the first step.
+    last_reach: float = 0.1  # The same in the last step.
+    keep: int = 6  # Poses that are kept, of different rotations.
+    truncation: float = 0.2  # A point farther from the other cloud counts as being this far away.
     lift_weight: float = 0.1  # Cost of a pose that changes the object's height, if upright.
     # Cost of lying where the other scan's sensors looked through, if upright and known.
     free_weight: float = 1.0
-    field_weight: float = 2.0  # Cost of lying off the surface that the prior completes the other cloud to.
+    field_weight: float = 2.0  # Cost of lying off the other cloud's surface as the prior completes it.
 
 
 @dataclass(frozen=True)
@@ -94,21 +94,21 @@ class CodeMatcher:
     """Matching by the embeddings alone (paper §3.2)."""
 
     method: Literal["codes"] = "codes"  # It names these settings.
-    score: Literal["inv", "eqv", "both"] = "both"  # What pairs are scored by: Λ, 1/E or Λ ⊘ E.
+    score: Literal["inv", "eqv", "both"] = "both"  # Score of a pair: Λ, 1/E or Λ ⊘ E.
     # The best total, or (published code) the best pair first.
     assignment: Literal["hungarian", "greedy"] = "hungarian"
 
 
 @dataclass(frozen=True)
 class EvidenceMatcher:
-    """Matching by surfaces: the embeddings propose pairs, how well a pair's surfaces fit decides (beyond the paper)."""
+    """Matching by surfaces: codes propose pairs, and the fit of their surfaces decides (beyond the paper)."""
 
     method: Literal["evidence"] = "evidence"  # It names these settings.
-    candidates: int = 8  # So many partners of every object, and of every instance, are aligned. 0: all are.
-    # In what is proposed: weight of |log| of the ratio of the F_s against the cosine of the F_inv.
+    candidates: int = 8  # Partners of every object, and of every instance, that are aligned. 0: all.
+    # Weight in the proposal of |log F_s ratio|, beside the cosine of the F_inv.
     size_weight: float = 0.5
-    motion_weight: float = 0.2  # Log odds that a meter moved costs. It decides among identical objects.
-    # Its evidence is calibrated on poses found without free space, which has its say when they are refined.
+    motion_weight: float = 0.2  # Log odds that each meter moved costs. It decides among identical objects.
+    # The evidence is calibrated on poses found without free space, which counts when they are refined.
     search: SurfaceSearch = SurfaceSearch(free_weight=0.0)
 
 
@@ -118,7 +118,7 @@ class DescentRegistration:
 
     method: Literal["descent"] = "descent"  # It names these settings.
     points: int = 1024  # Size of the farthest-point samples.
-    sdf_points: int = 1024  # The field is asked at so many of them.
+    sdf_points: int = 1024  # Points at which the field is evaluated.
     steps: int = 200  # Steps of Adam on SE(3).
     learning_rate: float = 1e-3  # Radians, and shares of the target's radius.
     sdf_weight: float = 1.0  # Weight in the loss of |Ψ| at the moved source's points.
@@ -134,23 +134,23 @@ class DescentRegistration:
 class SurfaceRegistration:
     """Registration by point-to-plane alignment of both surfaces (beyond the paper); lengths in shares of the radius.
 
-    Refines the poses that matching found, or those of `search` where it is given none.
+    Refines the poses that matching found, or those of `search` if it is given none.
     """
 
     method: Literal["surface"] = "surface"  # It names these settings.
     search: SurfaceSearch = field(default_factory=SurfaceSearch)
-    # "It did not move" is tried, too, and chosen if it fits nearly as well as the best.
+    # Whether "it did not move" is tried, and chosen if it fits nearly as well as the best.
     try_stayed: bool = True
-    points: int = 256  # So many points of each cloud are compared with all of the other.
-    steps: int = 15  # Every pose is aligned by so many steps.
+    points: int = 256  # Points of each cloud that are compared with all of the other.
+    steps: int = 15  # Steps that align every pose.
     first_reach: float = 0.1  # Reach of a correspondence in the first step.
     last_reach: float = 0.03  # Reach of a correspondence in the last step.
-    # The prior tells so many refined poses apart, each turned otherwise, and "it did not move".
+    # Refined poses of different rotations among which the prior chooses, beside "it did not move".
     choose_among: int = 3
-    field_points: int = 1024  # So many points of each cloud are asked of the other's completed surface.
-    polish_points: int = 512  # So many points are compared for the best pose alone, in the end.
-    polish_steps: int = 10  # The best pose is aligned by so many steps more.
-    polish_reach: float = 0.02  # Reach of a correspondence in the last of these.
+    field_points: int = 1024  # Points of each cloud whose distance to the other's completed surface counts.
+    polish_points: int = 512  # Points that are compared in the last alignment, of the best pose.
+    polish_steps: int = 10  # Steps of that last alignment.
+    polish_reach: float = 0.02  # Reach of a correspondence in its last step.
     trim: float = 0.7  # This share of the nearest distances counts in the residual.
     converged_rms: float = 0.05  # A pose that has settled has converged if its residual is lower.
 
@@ -163,15 +163,15 @@ class FieldRegistration:
     # Turns of the codes' rotation about the vertical, if upright. In any orientation all 60 of an icosahedron are
     # tried.
     turns: int = 24
-    # So many points of each cloud are asked of the other's field while all starts are aligned.
+    # Points of each cloud at which the other's field is evaluated while all starts are aligned.
     search_points: int = 64
-    search_steps: int = 6  # Steps of Gauss-Newton that align every start.
-    first_reach: float = 0.3  # A point so far off the surface counts a quarter in the first step.
+    search_steps: int = 6  # Gauss-Newton steps that align every start.
+    first_reach: float = 0.3  # Distance to the surface at which a point counts a quarter in the first step.
     search_reach: float = 0.1  # The same in the last step of the search, and in the first that refines.
-    keep: int = 4  # So many poses are refined, each turned otherwise.
-    points: int = 512  # So many points of each cloud are asked then.
-    steps: int = 10  # Steps of Gauss-Newton that refine those poses.
-    last_reach: float = 0.02  # A point so far off the surface counts a quarter in the last of these steps.
+    keep: int = 4  # Poses that are refined, of different rotations.
+    points: int = 512  # The same points, while those poses are refined.
+    steps: int = 10  # Gauss-Newton steps that refine those poses.
+    last_reach: float = 0.02  # The same distance in the last of these steps.
     trim: float = 0.7  # This share of the nearest distances counts in the residual.
     converged_rms: float = 0.05  # A pose that has settled has converged if its residual is lower.
 
@@ -188,7 +188,7 @@ class JointConfig:
     """Joint optimization of code and poses (paper §3.5); the defaults are the paper's."""
 
     steps: int = 200  # Steps of Adam. 0: codes and poses stay.
-    points: int = 1024  # Farthest points taken of every observation.
+    points: int = 1024  # Points of every observation, by farthest-point sampling.
     # F_0 is the code of the observation with the lowest loss, or that of all together.
     start: Literal["best", "accumulated"] = "best"
     eqv_learning_rate: float = 1e-4  # Learning rate of F_eqv.
@@ -205,23 +205,23 @@ class MeshingConfig:
     docs/developing/notebook/mesh_surface.md.
     """
 
-    coarse_resolution: int = 32  # The first grid has so many cells a side.
-    resolution: int = 64  # The last grid has so many: `coarse_resolution`, doubled some times.
-    # Cells a side of the finest grid that the network is asked on; finer ones interpolate. 0: all ask.
+    coarse_resolution: int = 32  # Cells of the first grid along each side.
+    resolution: int = 64  # Cells of the last grid: `coarse_resolution` times a power of two.
+    # Cells of the finest grid on which the network is evaluated; finer grids interpolate. 0: no limit.
     field_resolution: int = 0
     # The surface is where the field is 0, or its median at the observed points.
     level: Literal["zero", "observed"] = "zero"
     # Bandwidth of implicit moving least squares at observed points. 0: the field alone decides.
     mls_bandwidth: float = 0.0
-    # ℓ of the screened Poisson equation, on grids finer than `field_resolution`. So near to observed points their
-    # normals say what is inside, farther off the field does. 0: there is no such equation.
+    # ℓ of the screened Poisson equation, on grids finer than `field_resolution`. Nearer to observed points their
+    # normals say what is inside, farther off the field does. 0: no such equation.
     screening_length: float = 0.0
     # The same for points without noise that several scans saw. 0: as for one scan.
     screening_length_multi_scan: float = 0.0
     outlier_factor: float = 0.0  # Points with a larger local outlier factor are left out. 0: all points stay.
-    # The same where several scans saw the object, and confirm one another.
+    # The same for an object that several scans saw.
     outlier_factor_multi_scan: float = 0.0
-    clip_to_floor: bool = False  # Nothing reaches below the floor, where scans are upright and show it.
+    clip_to_floor: bool = False  # Whether meshes end at the floor, if scans are upright and show it.
 
 
 @dataclass(frozen=True)
@@ -235,22 +235,22 @@ class PoseGraphConfig:
 class SceneConfig:
     """Settings of the whole method; `preset('robust')` is the default, `preset('paper')` follows the paper."""
 
-    preset: str = "paper"  # Whose settings these are, or began as.
-    # Objects turn about the vertical (z) only. None: they do where the first scan shows a level floor.
+    preset: str = "paper"  # The preset that these settings are, or began as.
+    # Objects turn about the vertical (z) only. None: they do if the first scan shows a level floor.
     upright: bool | None = None
     min_points: int = 64  # Objects seen with fewer points are skipped, and reported.
-    # An object is static that turned by less, degrees, and moved by less than `static_m`.
+    # An object is static if it turned by less than this, degrees, and moved by less than `static_m`.
     static_deg: float = 1.0
-    # An object is static that moved by less, meters, and turned by less than `static_deg`.
+    # An object is static if it moved by less than this, meters, and turned by less than `static_deg`.
     static_m: float = 0.05
-    # Match and register against all seen so far, not against the reference observation.
+    # Match and register against all points seen so far, not against the first observation.
     accumulate_target: bool = False
-    # What pairs that are registered together, and objects that are meshed side by side, may take of the memory
-    # beside the scene. Results do not depend on it.
+    # Memory for pairs that are registered together and objects that are meshed side by side, beside the scene.
+    # Results do not depend on it.
     memory_mb: int = 1024
-    # Join what masks split, divide what they merge, leave out floor and neighbors, take in what they cut off.
+    # Join split masks, divide merged ones, leave out floor and neighbors, take in what was cut off.
     repair_masks: bool = False
-    accumulate_misfit: float = 1.0  # An observation whose registration fits worse is left out of the shape.
+    accumulate_misfit: float = 1.0  # An observation with a higher misfit is left out of the shape.
     matching: Matcher = field(default_factory=CodeMatcher)
     registration: RegistrationMethod = field(default_factory=DescentRegistration)
     pose_graph: PoseGraphConfig = field(default_factory=PoseGraphConfig)
