@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import partial
+from typing import Any
 
 import flax.linen as nn
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jaxtyping import Bool, Float
@@ -14,7 +16,6 @@ from jaxtyping import Bool, Float
 from eval.peers.learned.clouds import centered, thinned
 from eval.peers.learned.occupancy_mesh import surface
 from eval.peers.learned.registry import Params, Trained, of_task
-from eval.peers.learned.rpmnet import ROUNDS
 from eval.peers.matching import Matched, Matcher, assigned
 from eval.peers.reconstruction import Surfacer
 from eval.peers.registration import FEWEST, Registrar, diagonal, refined
@@ -36,7 +37,7 @@ def learned_registrars(given: tuple[str, ...]) -> dict[str, Registrar]:
     """By title: the network alone, and with GICP after it. ValueError as `of_task`."""
     found: dict[str, Registrar] = {}
     for t in of_task(given, "registration"):
-        found |= {t.peer.title: partial(by_rounds, t), f"{t.peer.title} + GICP": partial(then_gicp, t)}
+        found |= {t.peer.title: partial(by_network, t), f"{t.peer.title} + GICP": partial(then_gicp, t)}
     return found
 
 
@@ -63,22 +64,22 @@ def by_code(trained: Trained, one: Sequence[Instance], other: Sequence[Instance]
 
 
 @partial(jax.jit, static_argnames=("network", "upright"))
-def _rounds(
+def _pose(
     network: nn.Module, params: Params, points: Float[Array, "2 n 3"], mask: Bool[Array, "2 n"], upright: bool
 ) -> tuple[Float[Array, "4 4"], Float[Array, "2 3"], Float[Array, ""]]:
     source, target = (centered(points[i], mask[i]) for i in (0, 1))
     unit = target.radius
-    moved = source.points * source.radius / unit
-    poses, _ = network.apply(params, moved, mask[0], target.points, mask[1], ROUNDS, upright)  # type: ignore[misc]
-    return poses[-1], jax.numpy.stack([source.mean, target.mean]), unit
+    clouds = source.points * source.radius / unit, mask[0], target.points, mask[1]
+    T: Any = network.apply(params, *clouds, upright, method="pose")
+    return T, jnp.stack([source.mean, target.mean]), unit
 
 
-def by_rounds(trained: Trained, source: Points, target: Points, upright: bool) -> Pose | None:
+def by_network(trained: Trained, source: Points, target: Points, upright: bool) -> Pose | None:
     """The network's own pose from no start but the clouds' means, meters; None of next to nothing."""
     if min(len(source), len(target)) < FEWEST:
         return None
     points, mask, origin = thinned([source, target], trained.peer.points)
-    T, means, unit = map(np.asarray, _rounds(trained.peer.network, trained.params, points, mask, upright))
+    T, means, unit = map(np.asarray, _pose(trained.peer.network, trained.params, points, mask, upright))
     if not np.isfinite(T).all():
         return None
     means = means + origin
@@ -90,7 +91,7 @@ def by_rounds(trained: Trained, source: Points, target: Points, upright: bool) -
 
 def then_gicp(trained: Trained, source: Points, target: Points, upright: bool) -> Pose | None:
     """The network's pose, refined by GICP as those of the peers that learn nothing."""
-    found = by_rounds(trained, source, target, upright)
+    found = by_network(trained, source, target, upright)
     if found is None:
         return None
     start = found.copy()  # as `refined` takes it: between clouds about their means, in the target's diagonals

@@ -20,6 +20,7 @@ from jax import Array
 from jaxtyping import Float
 
 from eval.peers.learned.conv_onet import ConvONet, upright_occupancy_loss
+from eval.peers.learned.geotransformer import GeoTransformer, superpoint_loss
 from eval.peers.learned.rpmnet import RPMNet, registration_loss
 from eval.peers.learned.vn_dgcnn import VNDGCNN, matching_loss
 from eval.peers.learned.vn_onet import VNONet, occupancy_loss
@@ -77,6 +78,14 @@ PEERS: Mapping[str, LearnedPeer] = {
         network=RPMNet(),
         loss=registration_loss,
         points=128,
+        batch=12,
+    ),
+    "geotransformer": LearnedPeer(
+        title="GeoTransformer, small",
+        task="registration",
+        network=GeoTransformer(),
+        loss=superpoint_loss,
+        points=256,
         batch=12,
     ),
 }
