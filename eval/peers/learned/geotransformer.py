@@ -112,8 +112,8 @@ class GeoTransformer(nn.Module):
         a, b = self(source, source_mask, target, target_mask)
         pair = likeliest(likeness(a, b), PAIRS)
         weight = mutual(jnp.exp(self.partners(a, b, pair)[:, :-1, :-1]))
-        ends = (d.points[d.patches.members[pair[:, k]]] for k, d in enumerate((a, b)))
-        return local_to_global(*ends, weight, upright)
+        source, target = (d.points[d.patches.members[pair[:, k]]] for k, d in enumerate((a, b)))
+        return local_to_global(source, target, weight, upright)
 
 
 def unit(x: Float[Array, "s w"]) -> Float[Array, "s w"]:
@@ -151,7 +151,8 @@ def pair_loss(
 ) -> Float[Array, ""]:
     """The loss of one pair of clouds that lie in one frame, before the first is turned."""
     made = turned_pair(points, mask, turn)
-    a, b = network.apply(params, made.source, mask[0], made.target, mask[1])  # type: ignore[misc]
+    described: Any = network.apply(params, made.source, mask[0], made.target, mask[1])
+    a, b = described
     squared = jnp.sum((made.there[:, None] - made.target) ** 2, axis=-1)
     partner = mask[0][:, None] & mask[1] & (squared < PARTNER**2)
     shared = overlap(partner, a.patches, b.patches), overlap(partner.T, b.patches, a.patches)

@@ -1,4 +1,4 @@
-"""Trained peers as the tables of matching, registration and reconstruction take them."""
+"""Trained peers as the tables of matching, registration, reconstruction and the whole task take them."""
 
 from __future__ import annotations
 
@@ -13,12 +13,13 @@ import numpy as np
 from jax import Array
 from jaxtyping import Bool, Float
 
+from eval.peers.end_to_end import Stages
 from eval.peers.learned.clouds import centered, thinned
 from eval.peers.learned.occupancy_mesh import surface
-from eval.peers.learned.registry import Params, Trained, of_task
+from eval.peers.learned.registry import TASKS, Params, Trained, load, of_task
 from eval.peers.matching import Matched, Matcher, assigned
 from eval.peers.reconstruction import Surfacer
-from eval.peers.registration import FEWEST, Registrar, diagonal, refined
+from eval.peers.registration import FEWEST, Registrar, best_fit, diagonal
 from more2_jax.geometry.poses import Points, Pose
 from more2_jax.types import Instance
 
@@ -39,6 +40,26 @@ def learned_registrars(given: tuple[str, ...]) -> dict[str, Registrar]:
     for t in of_task(given, "registration"):
         found |= {t.peer.title: partial(by_network, t), f"{t.peer.title} + GICP": partial(then_gicp, t)}
     return found
+
+
+def learned_stages(given: tuple[str, ...], upright: bool) -> dict[str, Stages]:
+    """The whole task by one peer a stage, as MendNet combines them; none where none is asked for.
+
+    Raises ValueError as `load`, and unless there is one of each stage.
+    """
+    found = {t.peer.task: t for t in map(load, given)}
+    if not given:
+        return {}
+    if len(given) != len(TASKS) or set(found) != set(TASKS):
+        asked = ", ".join(f"{t.peer.title} ({k})" for k, t in found.items())
+        raise ValueError(f"learned peers {asked}; needed one of each of {', '.join(TASKS)}")
+    matcher, registrar, surfacer = (found[task] for task in TASKS)
+    stages = Stages(
+        match=partial(by_code, matcher),
+        register=partial(fit_gicp, registrar, upright=upright),
+        surface=partial(surface, surfacer),
+    )
+    return {" + ".join((matcher.peer.title, registrar.peer.title, "GICP", surfacer.peer.title)): stages}
 
 
 @partial(jax.jit, static_argnames="network")
@@ -91,10 +112,18 @@ def by_network(trained: Trained, source: Points, target: Points, upright: bool) 
 
 def then_gicp(trained: Trained, source: Points, target: Points, upright: bool) -> Pose | None:
     """The network's pose, refined by GICP as those of the peers that learn nothing."""
+    found = fit_gicp(trained, source, target, upright)
+    return None if found is None else found[0]
+
+
+def fit_gicp(trained: Trained, source: Points, target: Points, upright: bool) -> tuple[Pose, float] | None:
+    """`then_gicp`, and how far the clouds then lie apart (shares of the diagonal)."""
     found = by_network(trained, source, target, upright)
     if found is None:
         return None
-    start = found.copy()  # as `refined` takes it: between clouds about their means, in the target's diagonals
+    start = (
+        found.copy()
+    )  # as `best_fit` takes it: between clouds about their means, in the target's diagonals
     R, means = found[:3, :3], (source.mean(axis=0), target.mean(axis=0))
     start[:3, 3] = (found[:3, 3] + R @ means[0] - means[1]) / diagonal(target)
-    return refined(source, target, [start])
+    return best_fit(source, target, [start])

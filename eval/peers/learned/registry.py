@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import flax.linen as nn
 import jax
@@ -29,6 +29,7 @@ from train.shards.sampling import TrainingSample
 Params = Any  # a tree of arrays
 Loss = Callable[[nn.Module, Params, TrainingSample, Array], Float[Array, ""]]
 Task = Literal["matching", "registration", "reconstruction"]
+TASKS: tuple[Task, ...] = get_args(Task)
 
 FORMAT = 1  # of weight files
 SHIPPED = Path(__file__).parent / "weights"
@@ -73,7 +74,7 @@ PEERS: Mapping[str, LearnedPeer] = {
         batch=8,
     ),
     "rpmnet": LearnedPeer(
-        title="RPMNet, small",
+        title="RPM-Net, small",
         task="registration",
         network=RPMNet(),
         loss=registration_loss,
