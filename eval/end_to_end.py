@@ -18,10 +18,12 @@ import jax
 import tyro
 
 from eval.data.truth import KnownScene
-from eval.harness.options import OptionsBeside
+from eval.harness.options import OptionsBeside, benchmark, is_upright
 from eval.harness.program import Program, Summary, carry_out, run_program
 from eval.harness.runs import Run, Work, open_run
-from eval.peers.end_to_end import NAME, combined
+from eval.peers.end_to_end import NAME, combined, without_learning
+from eval.peers.learned.methods import learned_stages
+from eval.peers.learned.registry import stated
 from eval.scores.divided_masks import with_divided_masks
 from eval.scores.figures import Figure, Record, in_columns
 from eval.scores.temporal_ap import temporal_records
@@ -44,6 +46,9 @@ class Settings(OptionsBeside):
     batch_scenes: int = 1
     """Scenes held side by side, whose compiled calls take rows of several; `--at-once` of them work between calls.
     Times of a scene then include waiting for the others."""
+    learned: tuple[str, ...] = ()
+    """Learned peers combined to one more method, one for matching, one for registration, one for reconstruction: names
+    of shipped weights, or files of `eval.peers.learned.train`."""
 
 
 def figures() -> list[Figure]:
@@ -70,15 +75,17 @@ def main(options: Annotated[Settings, tyro.conf.arg(name="")]) -> None:
 
 def prepare(options: Settings) -> tuple[Run, Work]:
     """The run, and what is done with its scenes."""
-    names = [*(f"ours, {p}" for p in options.presets), *([NAME] if options.peers else [])]
-    current = open_run("end_to_end", options, {"methods": names, "samples": options.samples})
-    prior, upright = current.prior, current.config.upright
+    upright = is_upright(options, benchmark(options))
+    peers = {NAME: without_learning(upright)} if options.peers else {}
+    peers |= learned_stages(options.learned, upright)
+    facts = {"methods": [*(f"ours, {p}" for p in options.presets), *peers], "samples": options.samples}
+    current = open_run("end_to_end", options, {**facts, **stated(options.learned)})
     methods: dict[str, Callable[[KnownScene], list[Track]]] = {}
     for name in options.presets:
         config = preset(name, upright=upright)
-        methods[f"ours, {name}"] = lambda s, c=config: tracks_of(living_scene(s, prior, c))
-    if options.peers:
-        methods[NAME] = lambda s: combined(s.scans, bool(upright))
+        methods[f"ours, {name}"] = lambda s, c=config: tracks_of(living_scene(s, current.prior, c))
+    for name, stages in peers.items():
+        methods[name] = lambda s, p=stages: combined(s.scans, p)
 
     def one(scene: KnownScene) -> list[Record]:
         return [

@@ -49,8 +49,9 @@ KABSCH = "Kabsch on F_eqv alone"  # a learned peer, as FreeReg: one look at the 
 class Settings(OptionsBeside):
     """Which data, which settings, and where results go."""
 
-    pairs: Literal["first", "all"] = "all"
-    """Every later scan onto the first, or only the second (as the published evaluation of FlyingShape has it)."""
+    pairs: Literal["first", "all", "rigid"] = "all"
+    """Every later scan onto the first, or only the second (as the published evaluation of FlyingShape has it), or only
+    objects of which 3RScan lists a rigid motion there (as that of 3RScan has it)."""
     learned: tuple[str, ...] = ()
     """Learned peers measured too: names of shipped weights, or files of `eval.peers.learned.train`."""
 
@@ -193,6 +194,7 @@ def true_pairs(scene: KnownScene, which: str = "all") -> list[TruePair]:
         for k in range(1, last)
         for o in scene.objects
         if o.instance.get(0, LOST) != LOST and o.instance.get(k, LOST) != LOST
+        if which != "rigid" or o.rigid is None or k in o.rigid
     ]
 
 

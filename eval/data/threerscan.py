@@ -1,7 +1,8 @@
 """3RScan as a benchmark (paper §4): places of a split, the true associations, ambiguity chains, predicted masks.
 
-`<data>/3RScan.json`, or beside the folder of scans; `<data>/<scan>/…` as published. An object's model frame is the
-frame of the reference scan; that of objects which look alike, the pose of the one with the smallest id.
+`<data>/3RScan.json`, or beside the folder of scans; `<data>/<scan>/…` as published: the evaluation's back-projected
+cloud where it is there, else the vertices of the annotated mesh. An object's model frame is the frame of the reference
+scan; that of objects which look alike, the pose of the one with the smallest id.
 """
 
 from __future__ import annotations
@@ -12,9 +13,10 @@ from pathlib import Path
 import numpy as np
 
 from eval.data.masks import associated
+from eval.data.threerscan_cloud import ANNOTATED, PREDICTED, has_published_cloud, read_published
 from eval.data.threerscan_index import CATEGORIES, SYMMETRY_FOLDS, Place, Rescan, read_index
 from eval.data.truth import Benchmark, KnownObject, KnownScene
-from more2_jax.geometry.poses import apply_pose, rotation_error_deg
+from more2_jax.geometry.poses import Pose, apply_pose, rotation_error_deg
 from more2_jax.scans.read_scan import read_scan
 from more2_jax.storage.ply_files import read_mesh
 from more2_jax.types import Mesh, Scan
@@ -48,11 +50,14 @@ def read_place(data: Path, place: Place, *, predicted: bool = False) -> KnownSce
     `predicted` looks through predicted masks instead; each object is shown by the mask that overlaps it most.
     """
     folders = [data / name for name in (place.reference, *(r.id for r in place.rescans))]
-    scans = [movable(folder) for folder in folders]
+    poses = [np.eye(4), *(r.T_ref_rescan for r in place.rescans)]
+    scans = [movable(folder, T) for folder, T in zip(folders, poses, strict=True)]
     labels = [{i.id: i.label or "" for i in scan.instances} for scan in scans]
     objects = tuple(_object(data, place, i, labels, scans[0]) for i in sorted(labels[0]))
     scene = KnownScene(name=place.reference, scans=tuple(scans), objects=objects)
-    return associated(scene, [read_predicted(folder) for folder in folders]) if predicted else scene
+    if not predicted:
+        return scene
+    return associated(scene, [read_predicted(folder, T) for folder, T in zip(folders, poses, strict=True)])
 
 
 def true_mesh(data: Path, place: Place, id_: int, T_ref_model: np.ndarray) -> Mesh | None:
@@ -66,16 +71,19 @@ def true_mesh(data: Path, place: Place, id_: int, T_ref_model: np.ndarray) -> Me
     )
 
 
-def movable(folder: Path) -> Scan:
+def movable(folder: Path, T_ref_scan: Pose) -> Scan:
     """A scan with its annotated instances of movable categories."""
-    scan = read_scan(folder, min_points=1)
+    published = has_published_cloud(folder)
+    scan = read_published(folder, T_ref_scan, ANNOTATED) if published else read_scan(folder, min_points=1)
     kept = tuple(i for i in scan.instances if i.label in CATEGORIES)
     return dataclasses.replace(scan, instances=kept)
 
 
-def read_predicted(folder: Path) -> Scan:
+def read_predicted(folder: Path, T_ref_scan: Pose) -> Scan:
     """A scan with all its predicted instances. Raises ValueError if there is no file of masks."""
-    files = [folder / "mask3d.labels.npz", folder / f"{folder.name}.txt", folder / f"{folder.name}.npz"]
+    if has_published_cloud(folder) and (folder / PREDICTED).is_file():
+        return read_published(folder, T_ref_scan, PREDICTED)
+    files = [folder / PREDICTED, folder / f"{folder.name}.txt", folder / f"{folder.name}.npz"]
     masks = next((f for f in files if f.is_file()), None)
     if masks is None:
         raise ValueError(f"{folder}: no predicted masks; needed {', '.join(f.name for f in files)}")
@@ -85,7 +93,7 @@ def read_predicted(folder: Path) -> Scan:
 def _object(data: Path, place: Place, id_: int, labels: list[dict[int, str]], reference: Scan) -> KnownObject:
     """An object of the reference, with what is annotated of it in every rescan."""
     root, T_ref_model = _model_frame(place, id_)
-    poses, instance, moved = {0: T_ref_model}, {0: id_}, {0: False}
+    poses, instance, moved, rigid = {0: T_ref_model}, {0: id_}, {0: False}, set[int]()
     symmetry = 0
     for k, rescan in enumerate(place.rescans, start=1):
         found = [i for i in labels[k] if rescan.instance_in_reference(i) == id_]
@@ -94,7 +102,9 @@ def _object(data: Path, place: Place, id_: int, labels: list[dict[int, str]], re
         instance[k] = found[0]
         poses[k] = np.linalg.inv(rescan.pose_of(found[0])) @ T_ref_model
         moved[k] = has_moved(rescan, found[0])
-        symmetry = max(symmetry, next((m.symmetry for m in rescan.moved if m.instance_ref == id_), 0))
+        listed = [m.symmetry for m in rescan.moved if m.instance_ref == id_]
+        rigid |= {k} if listed else set()
+        symmetry = max(symmetry, *listed[:1], 0)
     center = _center(reference, id_, T_ref_model)
     return KnownObject(
         name=f"instance_{id_}",
@@ -106,6 +116,7 @@ def _object(data: Path, place: Place, id_: int, labels: list[dict[int, str]], re
         symmetry=SymmetryGroup.turns(SYMMETRY_FOLDS.get(symmetry, 1), center),
         forgiven_deg=FORGIVEN_DEG.get(symmetry, ()),
         moved=moved,
+        rigid=frozenset(rigid),
     )
 
 

@@ -30,6 +30,7 @@ class KnownObject:
     mesh: Mesh | None = None  # closed, model frame; None where the data set has none
     forgiven_deg: tuple[float, ...] = (90.0, 180.0)  # by the published evaluation
     moved: dict[int, bool] = field(default_factory=dict)  # since the first scan; absent: not known
+    rigid: frozenset[int] | None = None  # scans whose own pose of it is annotated (3RScan's rigid); None: all
     canonical: float = 1.0  # canonical units a meter
     parts: dict[int, tuple[int, ...]] = field(
         default_factory=dict

@@ -1,16 +1,17 @@
-"""The whole task without a learned prior: registration of all pairs to match, many starts of GICP, ball pivoting."""
+"""The whole task by peers, one a stage: registration of all pairs to match, many starts of GICP, ball pivoting."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
-from eval.peers.matching import by_registration
-from eval.peers.reconstruction import ball_pivoting
+from eval.peers.matching import Matcher, by_registration
+from eval.peers.reconstruction import Surfacer, ball_pivoting
 from eval.peers.registration import TRUNCATED, best_fit, starts
 from eval.scores.tracks import Track
-from more2_jax.geometry.poses import apply_pose
+from more2_jax.geometry.poses import Points, Pose, apply_pose
 from more2_jax.types import Instance, Scan
 
 NAME = "all-pairs GICP + multi-start GICP + ball pivoting"
@@ -18,24 +19,41 @@ REJECT = 0.05  # of the diagonal: clouds that stay this far apart show two objec
 FEWEST = 64  # points of an instance that is used at all
 
 
-def combined(scans: Sequence[Scan], upright: bool) -> list[Track]:
+@dataclass(frozen=True, kw_only=True)
+class Stages:
+    """Who matches, registers (source, target: the pose, and how far apart it leaves them) and makes meshes."""
+
+    match: Matcher
+    register: Callable[[Points, Points], tuple[Pose, float] | None]
+    surface: Surfacer
+
+
+def without_learning(upright: bool) -> Stages:
+    """The best of each stage that learns nothing."""
+    return Stages(
+        match=by_registration(upright, REJECT),
+        register=lambda source, target: best_fit(source, target, starts(upright)),
+        surface=ball_pivoting,
+    )
+
+
+def combined(scans: Sequence[Scan], stages: Stages) -> list[Track]:
     """Every scan in turn is matched to all objects known so far, each with all that was seen of it.
 
     A pair that fits badly is not one object.
     """
-    match = by_registration(upright, REJECT)
     tracks: list[Track] = []
     for k, scan in enumerate(scans):
         new = [i for i in scan.instances if len(i.points) >= FEWEST]
         old = [Instance(id=n, points=t.points) for n, t in enumerate(tracks)]
-        matched = match(old, new) if old and new else {}
+        matched = stages.match(old, new) if old and new else {}
         by_id = {i.id: i for i in new}
         for n, id_ in matched.items():
-            found = best_fit(by_id[id_].points, old[n].points, starts(upright))
-            if found is not None:
+            found = stages.register(by_id[id_].points, old[n].points)
+            if found is not None and found[1] < REJECT:
                 tracks[n] = extended(tracks[n], k, by_id.pop(id_), *found)
         tracks += [begun(k, i) for i in by_id.values()]
-    return [Track(**{**vars(t), "mesh": ball_pivoting(t.points)}) for t in tracks]
+    return [Track(**{**vars(t), "mesh": stages.surface(t.points)}) for t in tracks]
 
 
 def begun(scan: int, i: Instance) -> Track:

@@ -1,10 +1,13 @@
 """The published layouts as fixtures: FlyingShape's npz files; 3RScan with annotated and predicted masks."""
 
+import dataclasses
 import json
+import shutil
 
 import numpy as np
 import pytest
 import trimesh
+from dataset_writers.ply_file import vertex_columns, write_ply
 from dataset_writers.threerscan import column_major, write_annotated_mesh, write_semseg
 from known_scenes import pose
 from published_folder import SCENE, write_published
@@ -13,8 +16,10 @@ from eval.data.flyingshape import digest, flyingshape
 from eval.data.masks import LOST
 from eval.data.threerscan import threerscan
 from eval.harness.options import Options, benchmark, is_upright
+from eval.registration import true_pairs
 from eval.scores.match_scores import match_scores
 from eval.scores.pose_scores import pose_scores
+from more2_jax.geometry.poses import apply_pose
 from more2_jax.storage.ply_files import write_mesh
 from more2_jax.types import Mesh
 
@@ -169,6 +174,51 @@ def test_predicted_masks_show_the_objects_they_overlap_most(places):
     assert one.instance == {0: 1, 1: 1} and two.instance == {0: 2, 1: 2}
     assert len(scene.instance(1, 1).points) == 150
     assert [len(s.instances) for s in scene.scans] == [3, 2]  # the reference's plant is a distractor
+
+
+@pytest.fixture
+def published(places, tmp_path):
+    """The same place with the published evaluation's clouds: other points than the mesh's, in the reference's frame."""
+    folder = tmp_path / "3rscan"
+    shutil.copytree(places, folder)
+    for name, poses, T in (("ref", T_REF, np.eye(4)), ("later", T_RESCAN, T_WORLD)):
+        shapes = {i: SHAPE[LABEL[i]][:100] + 0.001 for i in poses}
+        points = np.concatenate([apply_pose(T @ poses[i], p) for i, p in shapes.items()])
+        write_ply(folder / name / "pointcloud.instances.align.ply", vertex_columns(points))
+        ids = np.concatenate([np.full(100, i) for i in poses])
+        np.savez(folder / name / "pointcloud.labels.npz", objectId=ids)
+        np.savez(folder / name / "mask3d.labels.npz", objectId=np.where(ids == 3, 0, ids))
+    return folder
+
+
+def test_published_clouds_are_read_in_their_scans_own_frames(published):
+    scene = threerscan(published, split="validation", predicted=False).read("ref")
+    one, two, table = scene.objects
+    assert {len(i.points) for s in scene.scans for i in s.instances} == {100}
+    for a, b in ((one, one), (two, two), (table, table), (two, one)):
+        assert scores(scene, a, b)["re_deg.paper"] == pytest.approx(0, abs=1e-4)
+    expected = apply_pose(T_RESCAN[1], SHAPE["chair"][:100] + 0.001)
+    np.testing.assert_allclose(scene.instance(1, 1).points, expected, atol=1e-5)
+
+
+def test_published_predicted_masks_are_of_the_published_cloud(published):
+    scene = threerscan(published, split="validation", predicted=True).read("ref")
+    one, two, table = scene.objects
+    assert set(table.instance.values()) == {LOST}
+    assert one.instance == {0: 1, 1: 1} and two.instance == {0: 2, 1: 2}
+    assert len(scene.instance(1, 1).points) == 100
+    np.savez(published / "later" / "mask3d.labels.npz", objectId=np.zeros(900, int))
+    with pytest.raises(ValueError, match="objectId is for 900 points; the scan has 300"):
+        threerscan(published, split="validation", predicted=True).read("ref")
+
+
+def test_pairs_that_3rscan_lists_as_rigid(places):
+    scene = threerscan(places, split="validation", predicted=False).read("ref")
+    assert [p.object.name for p in true_pairs(scene, "all")] == ["instance_1", "instance_2", "instance_3"]
+    assert [p.object.name for p in true_pairs(scene, "rigid")] == ["instance_1"]
+    everywhere = dataclasses.replace(scene.objects[2], rigid=None)  # of data that state every pose
+    known = dataclasses.replace(scene, objects=(everywhere,))
+    assert [p.object.name for p in true_pairs(known, "rigid")] == ["instance_3"]
 
 
 def test_what_is_missing_is_named(places, tmp_path):

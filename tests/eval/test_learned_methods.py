@@ -61,6 +61,33 @@ def test_a_run_states_which_weights_it_asked(with_tiny, tmp_path):
     assert registry.stated(()) == {}
 
 
+def test_training_goes_on_from_weights_and_counts_what_came_before(with_tiny, tmp_path, monkeypatch):
+    save(with_tiny, tmp_path / "tiny.npz")
+    assert train.begun("tiny", 0, None).training.minutes == 0
+    first = train.begun("tiny", 0, tmp_path / "tiny.npz")
+    assert first.training == HOW
+    now = train.trained(first, first.params, [1.0, 0.5], train.time.process_time() - 60, 5)
+    assert (now.training.steps, now.training.clouds) == (5, 24 + 2 * 2 * 4)
+    assert now.training.minutes == pytest.approx(1.1, abs=0.05) and now.training.loss == 0.5
+    monkeypatch.setitem(registry.PEERS, "other", tiny(title="other"))
+    with pytest.raises(ValueError, match="weights of tiny; needed those of other"):
+        train.begun("other", 0, tmp_path / "tiny.npz")
+
+
+def test_the_whole_task_needs_one_peer_of_each_stage(with_tiny, tmp_path, monkeypatch):
+    assert methods.learned_stages((), True) == {}
+    save(with_tiny, tmp_path / "tiny.npz")
+    for given in (("vn_dgcnn", "rpmnet"), ("vn_dgcnn", "rpmnet", "vn_onet", str(tmp_path / "tiny.npz"))):
+        with pytest.raises(ValueError, match="needed one of each of matching, registration, reconstruction"):
+            methods.learned_stages(given, True)
+    ((name, stages),) = methods.learned_stages(("vn_onet", "vn_dgcnn", "rpmnet"), True).items()
+    assert name == "VN-DGCNN, small + RPM-Net, small + GICP + VN-ONet, small"
+    source = legged(2000, 0)
+    found = stages.register(source, legged(2000, 1) + [3.0, -2, 0.1])
+    assert found is not None and found[1] < 0.05
+    np.testing.assert_allclose(found[0][:3, 3], [3, -2, 0.1], atol=0.1)
+
+
 def test_what_is_no_learned_peer_is_refused(with_tiny, tmp_path, monkeypatch):
     with pytest.raises(ValueError, match="no learned peer 'nonsense' is shipped; there are vn_"):
         load("nonsense")
@@ -157,16 +184,17 @@ def legged(count, seed):
 
 
 def test_what_is_shipped():
-    assert set(shipped()) == {"vn_dgcnn", "vn_onet", "rpmnet"}
+    assert set(shipped()) == set(registry.PEERS)
     sizes = [(registry.SHIPPED / f"{name}.npz").stat().st_size for name in shipped()]
     assert max(sizes) < 1e6 and sum(sizes) < 3e6
 
 
+@pytest.mark.parametrize("name", ["rpmnet", "geotransformer"])
 @pytest.mark.parametrize("degrees", [0, 20])
-def test_shipped_weights_find_a_small_turn_of_a_whole_cloud(degrees):
+def test_shipped_weights_find_a_small_turn_of_a_whole_cloud(degrees, name):
     T = pose(degrees, [3, -2, 0.1])
     source, target = legged(2000, 0), legged(2000, 1) @ T[:3, :3].T + T[:3, 3]
-    found = methods.learned_registrars(("rpmnet",))["RPMNet, small"](source, target, True)
+    found = methods.learned_registrars((name,))[registry.PEERS[name].title](source, target, True)
     assert found is not None and rotation_error_deg(found[:3, :3], T[:3, :3]) < 10
     np.testing.assert_allclose(found[2, :3], [0, 0, 1], atol=1e-6)
 
@@ -174,7 +202,7 @@ def test_shipped_weights_find_a_small_turn_of_a_whole_cloud(degrees):
 def test_shipped_weights_enclose_a_box():
     box = trimesh.creation.box((1.0, 0.8, 0.6))
     cloud = np.asarray(trimesh.sample.sample_surface(box, 2000, seed=0)[0]) + 7
-    for name, make in methods.learned_surfacers(("vn_onet",)).items():
+    for name, make in methods.learned_surfacers(("vn_onet", "conv_onet")).items():
         mesh = make(cloud)
         assert mesh is not None, name
         solid = trimesh.Trimesh(mesh.vertices, mesh.faces)
@@ -185,11 +213,11 @@ def test_shipped_weights_enclose_a_box():
 
 def test_few_points_have_no_pose():
     few = np.random.default_rng(0).normal(size=(3, 3))
-    for register in methods.learned_registrars(("rpmnet",)).values():
+    for register in methods.learned_registrars(("rpmnet", "geotransformer")).values():
         assert register(few, few + 1, False) is None
 
 
-@pytest.mark.parametrize("name", ["vn_dgcnn", "vn_onet", "rpmnet"])
+@pytest.mark.parametrize("name", registry.PEERS)
 def test_the_page_states_how_shipped_weights_came_about(name):
     page, of = (ROOT / "docs/concepts/learned_peers.md").read_text(encoding="utf-8"), load(name)
     table = {line.split("|")[1].strip(): line for line in page.splitlines() if line.startswith("| ")}

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from eval.peers.learned import conv_onet, rpmnet
+from eval.peers.learned import conv_onet, rpmnet, weighted_pose
 from eval.peers.learned.clouds import about_vertical, centered, thinned
+from eval.peers.learned.pair_features import oriented, pair_features
 from eval.peers.learned.sinkhorn import NONE, sinkhorn
 from eval.peers.learned.vn_dgcnn import VNDGCNN
 from eval.peers.learned.vn_onet import VNONet
@@ -147,14 +148,14 @@ def test_an_assignment_finds_a_permutation_and_leaves_out_who_has_no_partner():
 def test_pair_features_do_not_turn():
     R = Rotation.random(rng=np.random.default_rng(5)).as_matrix().astype(np.float32)
     whole = jnp.ones(32, bool)
-    here, there = (rpmnet.pair_features(rpmnet.oriented(jnp.asarray(c), whole)) for c in (CLOUD, CLOUD @ R.T))
+    here, there = (pair_features(oriented(jnp.asarray(c), whole)) for c in (CLOUD, CLOUD @ R.T))
     np.testing.assert_allclose(there, here, atol=2e-3)
     assert np.ptp(np.asarray(here), axis=(0, 1)).min() > 0.5
 
 
 def test_normals_of_a_plane_stand_on_it_and_face_outward():
     flat = RNG.uniform(-1, 1, (64, 3)) * [1, 1, 0] + [0, 0, 0.4]
-    cloud = rpmnet.oriented(jnp.asarray(flat, jnp.float32), jnp.ones(64, bool))
+    cloud = oriented(jnp.asarray(flat, jnp.float32), jnp.ones(64, bool))
     np.testing.assert_allclose(cloud.normals, np.tile([0, 0, 1], (64, 1)), atol=1e-3)
 
 
@@ -165,13 +166,13 @@ def test_the_pose_of_points_that_belong_together(upright):
         if upright
         else jaxlie.SO3.sample_uniform(jax.random.key(4)).as_matrix()
     )
-    T = rpmnet.pose(
+    T = weighted_pose.pose(
         jnp.asarray(CLOUD), CLOUD @ R.T + jnp.array([1.0, -2, 3]), jnp.asarray(REAL, jnp.float32), upright
     )
     np.testing.assert_allclose(T[:3, :3], R, atol=1e-4)
     np.testing.assert_allclose(T[:3, 3], [1, -2, 3], atol=1e-4)
     if upright:
-        tilted = rpmnet.pose(jnp.asarray(CLOUD), jnp.asarray(moved(CLOUD)), jnp.ones(32), True)
+        tilted = weighted_pose.pose(jnp.asarray(CLOUD), jnp.asarray(moved(CLOUD)), jnp.ones(32), True)
         np.testing.assert_allclose(tilted[2, :3], [0, 0, 1], atol=1e-6)
 
 

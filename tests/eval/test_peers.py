@@ -113,14 +113,37 @@ def test_surfaces_of_a_whole_cloud_lie_on_it(name):
 
 @need
 def test_the_peers_together_follow_a_scene():
-    from eval.peers.end_to_end import combined
+    from eval.peers.end_to_end import combined, without_learning
     from more2_jax.types import Scan
 
     sizes = [(1.0, 0.5, 0.3), (2.0, 1.0, 0.1)]
     scans = [Scan(name=str(s), source="", instances=tuple(instances(s, sizes))) for s in (1, 2)]
-    tracks = combined(scans, upright=True)
+    tracks = combined(scans, without_learning(upright=True))
     assert [t.instance for t in tracks] == [{0: 10, 1: 20}, {0: 11, 1: 21}]
     assert all(t.mesh is not None and len(t.points) == 3000 for t in tracks)
+
+
+@pytest.mark.parametrize("apart", [0.01, 0.08])
+def test_stages_are_asked_in_turn_and_a_pair_that_fits_badly_is_none(apart):
+    from eval.peers.end_to_end import Stages, combined
+    from more2_jax.types import Mesh, Scan
+
+    T = pose(90, [1.0, 0, 0])
+    mesh = Mesh(vertices=np.eye(3), faces=np.array([[0, 1, 2]]))
+    stages = Stages(
+        match=lambda old, new: {old[0].id: new[1].id},
+        register=lambda source, target: (T, apart),
+        surface=lambda points: mesh,
+    )
+    sizes = [(1.0, 0.5, 0.3), (2.0, 1.0, 0.1)]
+    scans = [Scan(name=str(s), source="", instances=tuple(instances(s, sizes))) for s in (1, 2)]
+    tracks = combined(scans, stages)
+    first = {0: 10, 1: 21} if apart < 0.05 else {0: 10}
+    assert tracks[0].instance == first and len(tracks) == (3 if apart < 0.05 else 4)
+    assert all(t.mesh is mesh for t in tracks)
+    if apart < 0.05:
+        np.testing.assert_array_equal(tracks[0].T_track_scan[1], T)
+        assert tracks[0].score < 1
 
 
 def test_a_missing_library_is_named():

@@ -1,23 +1,25 @@
-"""Trained peers as the tables of matching, registration and reconstruction take them."""
+"""Trained peers as the tables of matching, registration, reconstruction and the whole task take them."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import partial
+from typing import Any
 
 import flax.linen as nn
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jaxtyping import Bool, Float
 
+from eval.peers.end_to_end import Stages
 from eval.peers.learned.clouds import centered, thinned
 from eval.peers.learned.occupancy_mesh import surface
-from eval.peers.learned.registry import Params, Trained, of_task
-from eval.peers.learned.rpmnet import ROUNDS
+from eval.peers.learned.registry import TASKS, Params, Trained, load, of_task
 from eval.peers.matching import Matched, Matcher, assigned
 from eval.peers.reconstruction import Surfacer
-from eval.peers.registration import FEWEST, Registrar, diagonal, refined
+from eval.peers.registration import FEWEST, Registrar, best_fit, diagonal
 from more2_jax.geometry.poses import Points, Pose
 from more2_jax.types import Instance
 
@@ -36,8 +38,28 @@ def learned_registrars(given: tuple[str, ...]) -> dict[str, Registrar]:
     """By title: the network alone, and with GICP after it. ValueError as `of_task`."""
     found: dict[str, Registrar] = {}
     for t in of_task(given, "registration"):
-        found |= {t.peer.title: partial(by_rounds, t), f"{t.peer.title} + GICP": partial(then_gicp, t)}
+        found |= {t.peer.title: partial(by_network, t), f"{t.peer.title} + GICP": partial(then_gicp, t)}
     return found
+
+
+def learned_stages(given: tuple[str, ...], upright: bool) -> dict[str, Stages]:
+    """The whole task by one peer a stage, as MendNet combines them; none where none is asked for.
+
+    Raises ValueError as `load`, and unless there is one of each stage.
+    """
+    found = {t.peer.task: t for t in map(load, given)}
+    if not given:
+        return {}
+    if len(given) != len(TASKS) or set(found) != set(TASKS):
+        asked = ", ".join(f"{t.peer.title} ({k})" for k, t in found.items())
+        raise ValueError(f"learned peers {asked}; needed one of each of {', '.join(TASKS)}")
+    matcher, registrar, surfacer = (found[task] for task in TASKS)
+    stages = Stages(
+        match=partial(by_code, matcher),
+        register=partial(fit_gicp, registrar, upright=upright),
+        surface=partial(surface, surfacer),
+    )
+    return {" + ".join((matcher.peer.title, registrar.peer.title, "GICP", surfacer.peer.title)): stages}
 
 
 @partial(jax.jit, static_argnames="network")
@@ -63,22 +85,22 @@ def by_code(trained: Trained, one: Sequence[Instance], other: Sequence[Instance]
 
 
 @partial(jax.jit, static_argnames=("network", "upright"))
-def _rounds(
+def _pose(
     network: nn.Module, params: Params, points: Float[Array, "2 n 3"], mask: Bool[Array, "2 n"], upright: bool
 ) -> tuple[Float[Array, "4 4"], Float[Array, "2 3"], Float[Array, ""]]:
     source, target = (centered(points[i], mask[i]) for i in (0, 1))
     unit = target.radius
-    moved = source.points * source.radius / unit
-    poses, _ = network.apply(params, moved, mask[0], target.points, mask[1], ROUNDS, upright)  # type: ignore[misc]
-    return poses[-1], jax.numpy.stack([source.mean, target.mean]), unit
+    clouds = source.points * source.radius / unit, mask[0], target.points, mask[1]
+    T: Any = network.apply(params, *clouds, upright, method="pose")
+    return T, jnp.stack([source.mean, target.mean]), unit
 
 
-def by_rounds(trained: Trained, source: Points, target: Points, upright: bool) -> Pose | None:
+def by_network(trained: Trained, source: Points, target: Points, upright: bool) -> Pose | None:
     """The network's own pose from no start but the clouds' means, meters; None of next to nothing."""
     if min(len(source), len(target)) < FEWEST:
         return None
     points, mask, origin = thinned([source, target], trained.peer.points)
-    T, means, unit = map(np.asarray, _rounds(trained.peer.network, trained.params, points, mask, upright))
+    T, means, unit = map(np.asarray, _pose(trained.peer.network, trained.params, points, mask, upright))
     if not np.isfinite(T).all():
         return None
     means = means + origin
@@ -90,10 +112,18 @@ def by_rounds(trained: Trained, source: Points, target: Points, upright: bool) -
 
 def then_gicp(trained: Trained, source: Points, target: Points, upright: bool) -> Pose | None:
     """The network's pose, refined by GICP as those of the peers that learn nothing."""
-    found = by_rounds(trained, source, target, upright)
+    found = fit_gicp(trained, source, target, upright)
+    return None if found is None else found[0]
+
+
+def fit_gicp(trained: Trained, source: Points, target: Points, upright: bool) -> tuple[Pose, float] | None:
+    """`then_gicp`, and how far the clouds then lie apart (shares of the diagonal)."""
+    found = by_network(trained, source, target, upright)
     if found is None:
         return None
-    start = found.copy()  # as `refined` takes it: between clouds about their means, in the target's diagonals
+    start = (
+        found.copy()
+    )  # as `best_fit` takes it: between clouds about their means, in the target's diagonals
     R, means = found[:3, :3], (source.mean(axis=0), target.mean(axis=0))
     start[:3, 3] = (found[:3, 3] + R @ means[0] - means[1]) / diagonal(target)
-    return refined(source, target, [start])
+    return best_fit(source, target, [start])

@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import flax.linen as nn
 import jax
@@ -20,6 +20,7 @@ from jax import Array
 from jaxtyping import Float
 
 from eval.peers.learned.conv_onet import ConvONet, upright_occupancy_loss
+from eval.peers.learned.geotransformer import GeoTransformer, superpoint_loss
 from eval.peers.learned.rpmnet import RPMNet, registration_loss
 from eval.peers.learned.vn_dgcnn import VNDGCNN, matching_loss
 from eval.peers.learned.vn_onet import VNONet, occupancy_loss
@@ -28,6 +29,7 @@ from train.shards.sampling import TrainingSample
 Params = Any  # a tree of arrays
 Loss = Callable[[nn.Module, Params, TrainingSample, Array], Float[Array, ""]]
 Task = Literal["matching", "registration", "reconstruction"]
+TASKS: tuple[Task, ...] = get_args(Task)
 
 FORMAT = 1  # of weight files
 SHIPPED = Path(__file__).parent / "weights"
@@ -72,11 +74,19 @@ PEERS: Mapping[str, LearnedPeer] = {
         batch=8,
     ),
     "rpmnet": LearnedPeer(
-        title="RPMNet, small",
+        title="RPM-Net, small",
         task="registration",
         network=RPMNet(),
         loss=registration_loss,
         points=128,
+        batch=12,
+    ),
+    "geotransformer": LearnedPeer(
+        title="GeoTransformer, small",
+        task="registration",
+        network=GeoTransformer(),
+        loss=superpoint_loss,
+        points=256,
         batch=12,
     ),
 }

@@ -7,20 +7,17 @@ from functools import partial
 from typing import Any
 
 import flax.linen as nn
-import flax.struct
 import jax
 import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float
 
-from eval.peers.learned.clouds import about_vertical, centered
+from eval.peers.learned.pair_features import LEAST, Oriented, oriented, pair_features
 from eval.peers.learned.sinkhorn import sinkhorn
-from more2_jax.geometry.points import kabsch
-from more2_jax.network.vector_neurons import nearest_points
-from more2_jax.registration.starting_poses import yaw_of
+from eval.peers.learned.training_pairs import turned_pair, turns
+from eval.peers.learned.weighted_pose import pose
 from train.shards.sampling import TrainingSample
 
-NEIGHBORS = 12  # published: those within a radius, 64 at most
 FEATURES = 64  # published: 96
 SINKHORN_STEPS = 5
 TRAINING_ROUNDS, ROUNDS = 2, 5  # as published
@@ -28,41 +25,6 @@ TRAINING_ROUNDS, ROUNDS = 2, 5  # as published
 PARTNER = 0.2
 MATCH_WEIGHT = 0.1  # of the cross-entropy of correspondences, which the published loss has not
 INLIER_WEIGHT = 0.01  # as published
-LEAST = 1e-9
-
-
-@flax.struct.dataclass
-class Oriented:
-    """A cloud with normals, and the neighbors of every point."""
-
-    points: Float[Array, "n 3"]
-    normals: Float[Array, "n 3"]
-    mask: Bool[Array, " n"]
-    neighbors: Array  # (n, k) rows
-
-
-def oriented(points: Float[Array, "n 3"], mask: Bool[Array, " n"]) -> Oriented:
-    """Normals by the least spread among neighbors, away from the middle: no camera is known."""
-    index, real = nearest_points(points, mask, NEIGHBORS)
-    index = jnp.where(real, index, index[:, :1])  # fewer points than neighbors: the nearest again
-    offset = points[index] - points[index].mean(axis=1, keepdims=True)
-    normals = jnp.linalg.eigh(jnp.einsum("nki,nkj->nij", offset, offset))[1][:, :, 0]
-    outward = jnp.where(jnp.sum(normals * points, axis=-1, keepdims=True) < 0, -normals, normals)
-    return Oriented(points=points, normals=outward, mask=mask, neighbors=index)
-
-
-def angle(a: Float[Array, "*n 3"], b: Float[Array, "*n 3"]) -> Float[Array, "*n"]:
-    """Between vectors, radians; 0 where one of them vanishes."""
-    across = jnp.sqrt(jnp.sum(jnp.cross(a, b) ** 2, axis=-1) + LEAST**2)
-    return jnp.arctan2(across, jnp.sum(a * b, axis=-1) + LEAST)
-
-
-def pair_features(cloud: Oriented) -> Float[Array, "n k 4"]:
-    """Length and three angles of every point with each of its neighbors; turning the cloud changes none."""
-    d = cloud.points[cloud.neighbors] - cloud.points[:, None]
-    own, other = jnp.broadcast_to(cloud.normals[:, None], d.shape), cloud.normals[cloud.neighbors]
-    length = jnp.sqrt(jnp.sum(d * d, axis=-1) + LEAST**2)
-    return jnp.stack([length, angle(own, d), angle(other, d), angle(own, other)], axis=-1)
 
 
 class PointFeatures(nn.Module):
@@ -119,25 +81,17 @@ class RPMNet(nn.Module):
             found.append((T, partners))
         return jnp.stack([T for T, _ in found]), jnp.stack([p for _, p in found])
 
+    def pose(
+        self, source: Array, source_mask: Array, target: Array, target_mask: Array, upright: bool
+    ) -> Float[Array, "4 4"]:
+        """`T_target_source` after all rounds."""
+        return self(source, source_mask, target, target_mask, ROUNDS, upright)[0][-1]
+
     def _partners(self, one: Array, other: Array, one_mask: Array, other_mask: Array, k: int) -> Array:
         k = min(k, TRAINING_ROUNDS - 1)
         squared = 2.0 - 2.0 * one @ other.T
         scores = -nn.softplus(self.sharpness[k]) * (squared - nn.softplus(self.unlike[k]))
         return sinkhorn(scores, one_mask, other_mask, SINKHORN_STEPS)
-
-
-def pose(
-    source: Float[Array, "n 3"], target: Float[Array, "n 3"], weight: Float[Array, " n"], upright: bool
-) -> Float[Array, "4 4"]:
-    """The best pose between rows that belong together; with `upright`, the best of turns about z."""
-    if not upright:
-        return kabsch(source, target, weight).as_matrix()
-    share = weight / jnp.maximum(weight.sum(), LEAST)
-    mean, meant = share @ source, share @ target
-    h = ((source - mean) * share[:, None]).T @ (target - meant)
-    R = about_vertical(yaw_of(h.T))
-    top = jnp.concatenate([R, (meant - R @ mean)[:, None]], axis=1)
-    return jnp.concatenate([top, jnp.array([[0.0, 0.0, 0.0, 1.0]])])
 
 
 def registration_loss(
@@ -147,7 +101,7 @@ def registration_loss(
 
     Two clouds of a shape, one of them turned about the vertical by chance.
     """
-    angles = jax.random.uniform(key, (len(sample.points),), maxval=2 * jnp.pi)
+    angles = turns(key, len(sample.points))
     return jax.vmap(partial(pair_loss, network, params))(sample.points, sample.mask, angles).mean()
 
 
@@ -159,19 +113,16 @@ def pair_loss(
     turn: Float[Array, ""],
 ) -> Float[Array, ""]:
     """The loss of one pair of clouds that lie in one frame, before the first is turned."""
-    target, unturned = centered(points[1], mask[1]), centered(points[0], mask[0])
-    there = target.local(points[0])  # where source points belong
-    here = jnp.where(mask[0][:, None], unturned.points * unturned.radius / target.radius, 0.0)
-    source = here @ about_vertical(turn).T
-    given = source, mask[0], target.points, mask[1]
+    pair = turned_pair(points, mask, turn)
+    given = pair.source, mask[0], pair.target, mask[1]
     found: Any = network.apply(params, *given)
     poses, partners = found
-    landed = jax.vmap(lambda T: source @ T[:3, :3].T + T[:3, 3])(poses)
-    error = jnp.where(mask[0][:, None], jnp.abs(landed - there), 0.0).sum(axis=(1, 2)) / mask[0].sum()
+    landed = jax.vmap(lambda T: pair.source @ T[:3, :3].T + T[:3, 3])(poses)
+    error = jnp.where(mask[0][:, None], jnp.abs(landed - pair.there), 0.0).sum(axis=(1, 2)) / mask[0].sum()
     later = 0.5 ** jnp.arange(len(poses) - 1, -1, -1)
     unmatched = 1.0 - jnp.exp(partners[:, :-1, :-1]).sum(axis=-1)
     idle = jnp.where(mask[0], unmatched, 0.0).sum(axis=-1) / mask[0].sum()
-    unlike = jax.vmap(partial(partner_loss, there, target.points, mask[0], mask[1]))(partners)
+    unlike = jax.vmap(partial(partner_loss, pair.there, pair.target, mask[0], mask[1]))(partners)
     return jnp.sum(later * (error + INLIER_WEIGHT * idle + MATCH_WEIGHT * unlike))
 
 

@@ -25,6 +25,7 @@ from eval.peers.learned.registry import (
     Params,
     Trained,
     Training,
+    load,
     parameters,
     peer_named,
     save,
@@ -53,6 +54,7 @@ def main(
     minutes: float = 15.0,
     steps: int = 0,
     seed: int = 0,
+    begin: Path | None = None,
 ) -> None:
     """Trains a learned peer, and leaves its weights.
 
@@ -64,18 +66,30 @@ def main(
         minutes: of one core's time, after compiling; the learning rate falls with it.
         steps: so many instead, if above 0: then a run repeats exactly.
         seed: of weights and samples.
+        begin: weights of an earlier run, also one that was stopped, to go on from; its minutes are added.
     """
     peer = peer_named(name)
     if steps < 0 or minutes <= 0:
         raise ValueError(f"steps {steps}, minutes {minutes}; needed 0 steps or more, and minutes above 0")
     shapes, rows = load_mix(shards, "train")
-    params = start(name, seed)
+    first = begun(name, seed, begin)
     Console().print(
-        f"{peer.title}: {parameters(params):,} parameters, {len(shapes.views)} shapes", highlight=False
+        f"{peer.title}: {parameters(first.params):,} parameters, {len(shapes.views)} shapes", highlight=False
     )
-    done = fit(name, params, shapes, jnp.asarray(rows), Length(steps=steps, minutes=minutes), seed, out)
+    done = fit(first, shapes, jnp.asarray(rows), Length(steps=steps, minutes=minutes), seed, out)
     save(done, out)
     Console().print(f"{done.training}", highlight=False)
+
+
+def begun(name: str, seed: int, begin: Path | None) -> Trained:
+    """Weights that a run begins with: random ones, or those of an earlier run. ValueError if these are another's."""
+    if begin is None:
+        none = Training(steps=0, minutes=0.0, shapes=0, clouds=0, loss=float("nan"))
+        return Trained(name=name, params=start(name, seed), training=none)
+    found = load(str(begin))
+    if found.name != name:
+        raise ValueError(f"{begin}: weights of {found.peer.title}; needed those of {peer_named(name).title}")
+    return found
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -91,15 +105,16 @@ class Length:
 
 
 def fit(
-    name: str, params: Params, shapes: Shapes, rows: Int[Array, " r"], length: Length, seed: int, out: Path
+    first: Trained, shapes: Shapes, rows: Int[Array, " r"], length: Length, seed: int, out: Path
 ) -> Trained:
     """The peer after a run; what it has learned so far is written to `out` every minute."""
-    peer, key = peer_named(name), jax.random.key(seed)
+    peer, params, past = first.peer, first.params, first.training.steps
+    key = jax.random.key(seed)
     state: Any = optimizer().init(params)
     losses: list[float] = []
     began = saved = time.process_time()
     while (share := length.share(len(losses), began)) < 1:
-        keys = jax.random.split(jax.random.fold_in(key, len(losses)))
+        keys = jax.random.split(jax.random.fold_in(key, past + len(losses)))  # other samples than before
         sample = drawn(shapes, rows, keys[0], batch=peer.batch, points=peer.points)
         learning_rate = jnp.float32(rate(share) * peer.learning_rate)
         params, state, loss = step(params, state, sample, keys[1], learning_rate, peer=peer)
@@ -108,21 +123,22 @@ def fit(
             began = saved = time.process_time()
         if time.process_time() - saved > SAVE_EVERY_S:
             saved = time.process_time()
-            save(trained(name, params, losses, began, len(shapes.views)), out)
+            save(trained(first, params, losses, began, len(shapes.views)), out)
             Console().print(f"{len(losses)} steps, loss {np.mean(losses[-100:]):.4f}", highlight=False)
-    return trained(name, params, losses, began, len(shapes.views))
+    return trained(first, params, losses, began, len(shapes.views))
 
 
-def trained(name: str, params: Params, losses: list[float], began: float, shapes: int) -> Trained:
+def trained(first: Trained, params: Params, losses: list[float], began: float, shapes: int) -> Trained:
     """The weights as they are, with how they came about."""
+    past = first.training
     training = Training(
-        steps=len(losses),
-        minutes=round((time.process_time() - began) / 60, 2),
+        steps=past.steps + len(losses),
+        minutes=round(past.minutes + (time.process_time() - began) / 60, 2),
         shapes=shapes,
-        clouds=2 * peer_named(name).batch * len(losses),
+        clouds=past.clouds + 2 * first.peer.batch * len(losses),
         loss=float(np.mean(losses[-max(len(losses) // 100, 1) :])),
     )
-    return Trained(name=name, params=params, training=training)
+    return Trained(name=first.name, params=params, training=training)
 
 
 def rate(share: float) -> float:
