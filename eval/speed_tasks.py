@@ -22,7 +22,7 @@ from eval.data.flyingshape import open_flyingshape
 from eval.data.truth import KnownScene
 from eval.end_to_end import living_scene
 from eval.harness.batched import register_all
-from eval.peers.end_to_end import NAME, combined
+from eval.peers.end_to_end import NAME, combined, without_learning
 from eval.peers.registration import Registrar, registrars
 from eval.performance.stopwatch import Job, Seconds, interleaved, timed
 from eval.registration import TruePair, ready_pairs, true_pairs
@@ -109,7 +109,7 @@ def room_jobs(prior: Prior, rooms: Sequence[KnownScene], config: SceneConfig) ->
     jobs = {OURS: timed(lambda: run_scenes(prior, scans, config))}
     if len(rooms) > 1:
         jobs[ONE_BY_ONE] = timed(lambda: [living_scene(s, prior, config) for s in rooms])
-    return jobs | {NAME: timed(lambda: [combined(s, bool(config.upright)) for s in scans])}
+    return jobs | {NAME: timed(lambda: [combined(s, without_learning(bool(config.upright))) for s in scans])}
 
 
 def ratios(found: Mapping[tuple[str, str], Seconds]) -> list[dict[str, Any]]:
