@@ -63,10 +63,9 @@ def main(
         "one room of two scans": room_jobs(weights, known[:1], config),
         f"{len(known)} rooms of two scans": room_jobs(weights, known, config),
     }
-    jobs = {(task, who): job for task, of_task in tasks.items() for who, job in of_task.items()}
-    keys = {" / ".join(key): key for key in jobs}
-    found = interleaved({name: jobs[key] for name, key in keys.items()}, repeats)
-    rows = ratios({keys[name]: taken for name, taken in found.items()})
+    jobs = {f"{task} / {who}": job for task, of_task in tasks.items() for who, job in of_task.items()}
+    found = interleaved(jobs, repeats)
+    rows = ratios({tuple(name.split(" / ")): taken for name, taken in found.items()})
     Console().print(printed(rows))
     said = {
         "rooms": len(known),
@@ -112,7 +111,7 @@ def room_jobs(prior: Prior, rooms: Sequence[KnownScene], config: SceneConfig) ->
     return jobs | {NAME: timed(lambda: [combined(s, without_learning(bool(config.upright))) for s in scans])}
 
 
-def ratios(found: Mapping[tuple[str, str], Seconds]) -> list[dict[str, Any]]:
+def ratios(found: Mapping[tuple[str, ...], Seconds]) -> list[dict[str, Any]]:
     """A row a task and competitor."""
     rows = []
     for (task, who), taken in found.items():

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -38,12 +39,13 @@ class Sizes:
     queries: int = 1500
 
 
-def main(rooms: tuple[Path, ...], out: Path, sizes: Sizes = Sizes()) -> None:
+def main(rooms: tuple[Path, ...], out: Path, most: int | None = None, sizes: Sizes = Sizes()) -> None:
     """Writes one packed file; every tenth room is for validation.
 
     Args:
         rooms: folders that `train.synthesize --regime real` wrote.
         out: the .npz to write.
+        most: masks of one model, at most; by default all.
         sizes: how much is kept of a mask.
     """
     scenes = [s for folder in rooms for s in sorted(folder.glob("scene_????"))]
@@ -56,8 +58,12 @@ def main(rooms: tuple[Path, ...], out: Path, sizes: Sizes = Sizes()) -> None:
         scene = read_scene(folder)
         split = "train" if (n + 1) % VALIDATION_ROOMS else "val"
         for o in scene.objects:
-            known = queries.setdefault(o.model, model_queries(o, sizes.queries))
-            splits[split] += [known | seen for seen in masks_of(scene, o, sizes)]
+            if o.model not in queries:
+                queries[o.model] = model_queries(o, sizes.queries)
+            known = queries[o.model]
+            taken = sum(r["sdf_near"] is known["sdf_near"] for r in splits[split])
+            left = None if most is None else max(0, most - taken)
+            splits[split] += [known | seen for seen in islice(masks_of(scene, o, sizes), left)]
             credits[o.model] = {"name": o.model, "source": o.source, "license": o.license}
     out.parent.mkdir(parents=True, exist_ok=True)
     write_shapes(out, {split: stacked(rows) for split, rows in splits.items() if rows})
