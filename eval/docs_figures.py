@@ -42,9 +42,12 @@ FIGURES = {
     "mean RE": ("mean RE", "strict"),
     "median Chamfer-L1": ("median Chamfer-L1", "strict"),
     "Chamfer-L1": ("Chamfer-L1", "strict"),
+    "accuracy": ("accuracy", "strict"),
     "completeness": ("completeness", "strict"),
+    "F at 1 %": ("F at 1 % of the diagonal", "strict"),
     "SDF recall": ("SDF recall, objects", "strict"),
     "IoU": ("IoU", "paper"),
+    "published IoU": ("IoU", "published"),
     "time": ("time a scene", ""),
     "time a pair": ("time a pair", ""),
 }

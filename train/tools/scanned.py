@@ -27,7 +27,6 @@ from train.shards.signed_distance import signed_distances
 from train.tools.pack import write_credits
 
 FEWEST_POINTS = 100  # of a mask, within the box
-VALIDATION_ROOMS = 10  # one in so many
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,7 +39,7 @@ class Sizes:
 
 
 def main(rooms: tuple[Path, ...], out: Path, most: int | None = None, sizes: Sizes = Sizes()) -> None:
-    """Writes one packed file; every tenth room is for validation.
+    """Writes one packed file, all of it for training: validation needs other models, hence other rooms.
 
     Args:
         rooms: folders that `train.synthesize --regime real` wrote.
@@ -51,25 +50,23 @@ def main(rooms: tuple[Path, ...], out: Path, most: int | None = None, sizes: Siz
     scenes = [s for folder in rooms for s in sorted(folder.glob("scene_????"))]
     if not scenes:
         raise ValueError(f"{', '.join(map(str, rooms))}: no scenes; `python -m train.synthesize` makes them")
-    splits: dict[str, list[dict[str, np.ndarray]]] = {"train": [], "val": []}
+    rows: list[dict[str, np.ndarray]] = []
     credits: dict[str, dict[str, str]] = {}
     queries: dict[str, dict[str, np.ndarray]] = {}
-    for n, folder in enumerate(track(scenes, description="rooms")):
+    for folder in track(scenes, description="rooms"):
         scene = read_scene(folder)
-        split = "train" if (n + 1) % VALIDATION_ROOMS else "val"
         for o in scene.objects:
             if o.model not in queries:
                 queries[o.model] = model_queries(o, sizes.queries)
             known = queries[o.model]
-            taken = sum(r["sdf_near"] is known["sdf_near"] for r in splits[split])
+            taken = sum(r["sdf_near"] is known["sdf_near"] for r in rows)
             left = None if most is None else max(0, most - taken)
-            splits[split] += [known | seen for seen in islice(masks_of(scene, o, sizes), left)]
+            rows += [known | seen for seen in islice(masks_of(scene, o, sizes), left)]
             credits[o.model] = {"name": o.model, "source": o.source, "license": o.license}
     out.parent.mkdir(parents=True, exist_ok=True)
-    write_shapes(out, {split: stacked(rows) for split, rows in splits.items() if rows})
+    write_shapes(out, {"train": stacked(rows)})
     write_credits(out.with_suffix(".credits.tsv"), list(credits.values()))
-    counts = ", ".join(f"{len(rows)} {split}" for split, rows in splits.items())
-    print(f"{out}: {counts} masks of {len(credits)} models, {out.stat().st_size / 1e6:.1f} MB")
+    print(f"{out}: {len(rows)} masks of {len(credits)} models, {out.stat().st_size / 1e6:.1f} MB")
 
 
 def stacked(rows: Sequence[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
