@@ -201,9 +201,8 @@ def worth(row: dict[str, Any]) -> float:
 def cell(row: dict[str, Any], best: bool) -> str:
     """A figure, its interval, and in how many cases there is none."""
     text = bold(number(row["value"]), best)
-    if (
-        row["ci95"] and row["unit"] != "s"
-    ):  # times differ with what else a machine does, more than between rooms
+    # Times differ with what else a machine does, more than between rooms.
+    if row["ci95"] and row["unit"] != "s":
         text += f" ({number(row['ci95'][0])} to {number(row['ci95'][1])})"
     return text + (f"; {row['failures']} failed" if row["failures"] else "")
 

@@ -28,7 +28,7 @@ from more2_jax.geometry.padding import MAX_POINTS, pad_clouds
 from more2_jax.geometry.poses import Points, apply_pose
 from more2_jax.network.prior import Prior, encode_one, load_prior, sdf_one
 from more2_jax.types import Instance
-from train.furniture.closed_solids import canonical
+from train.furniture.closed_solids import canonical, canonical_frame
 from train.run.program import run
 from train.shards.signed_distance import signed_distances
 
@@ -103,10 +103,9 @@ def masks_of(scene: KnownScene) -> Iterator[KnownMask]:
 def in_canonical_frame(o: KnownObject, scan: int, mask: Instance) -> tuple[Points, Points]:
     """A mask's points and normals in the canonical frame of the object that it shows."""
     assert o.mesh is not None
-    _, scale = canonical(o.mesh.vertices)
-    low, high = o.mesh.vertices.min(axis=0), o.mesh.vertices.max(axis=0)
+    center, scale = canonical_frame(o.mesh.vertices)
     T = o.T_scan_model[scan]
-    points = (apply_pose(np.linalg.inv(T), mask.points) - (low + high) / 2) / scale
+    points = (apply_pose(np.linalg.inv(T), mask.points) - center) / scale
     normals = np.zeros_like(points) if mask.normals is None else mask.normals @ T[:3, :3]
     return points, normals
 

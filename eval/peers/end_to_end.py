@@ -26,6 +26,7 @@ class Stages:
     match: Matcher
     register: Callable[[Points, Points], tuple[Pose, float] | None]
     surface: Surfacer
+    reject: float = np.inf  # of the diagonal: pairs that registration leaves farther apart show two objects
 
 
 def without_learning(upright: bool) -> Stages:
@@ -40,7 +41,7 @@ def without_learning(upright: bool) -> Stages:
 def combined(scans: Sequence[Scan], stages: Stages) -> list[Track]:
     """Every scan in turn is matched to all objects known so far, each with all that was seen of it.
 
-    A pair that fits badly is not one object.
+    A pair that fits badly is not one object: matching tells, or registration where `stages.reject` asks for it.
     """
     tracks: list[Track] = []
     for k, scan in enumerate(scans):
@@ -50,7 +51,7 @@ def combined(scans: Sequence[Scan], stages: Stages) -> list[Track]:
         by_id = {i.id: i for i in new}
         for n, id_ in matched.items():
             found = stages.register(by_id[id_].points, old[n].points)
-            if found is not None and found[1] < REJECT:
+            if found is not None and found[1] <= stages.reject:
                 tracks[n] = extended(tracks[n], k, by_id.pop(id_), *found)
         tracks += [begun(k, i) for i in by_id.values()]
     return [Track(**{**vars(t), "mesh": stages.surface(t.points)}) for t in tracks]

@@ -123,8 +123,8 @@ def test_the_peers_together_follow_a_scene():
     assert all(t.mesh is not None and len(t.points) == 3000 for t in tracks)
 
 
-@pytest.mark.parametrize("apart", [0.01, 0.08])
-def test_stages_are_asked_in_turn_and_a_pair_that_fits_badly_is_none(apart):
+@pytest.mark.parametrize(("apart", "reject"), [(0.01, 0.05), (0.08, 0.05), (0.08, np.inf)])
+def test_stages_are_asked_in_turn_and_a_pair_that_fits_badly_is_none_where_asked(apart, reject):
     from eval.peers.end_to_end import Stages, combined
     from more2_jax.types import Mesh, Scan
 
@@ -134,14 +134,15 @@ def test_stages_are_asked_in_turn_and_a_pair_that_fits_badly_is_none(apart):
         match=lambda old, new: {old[0].id: new[1].id},
         register=lambda source, target: (T, apart),
         surface=lambda points: mesh,
+        reject=reject,
     )
     sizes = [(1.0, 0.5, 0.3), (2.0, 1.0, 0.1)]
     scans = [Scan(name=str(s), source="", instances=tuple(instances(s, sizes))) for s in (1, 2)]
     tracks = combined(scans, stages)
-    first = {0: 10, 1: 21} if apart < 0.05 else {0: 10}
-    assert tracks[0].instance == first and len(tracks) == (3 if apart < 0.05 else 4)
+    first = {0: 10, 1: 21} if apart < reject else {0: 10}
+    assert tracks[0].instance == first and len(tracks) == (3 if apart < reject else 4)
     assert all(t.mesh is mesh for t in tracks)
-    if apart < 0.05:
+    if apart < reject:
         np.testing.assert_array_equal(tracks[0].T_track_scan[1], T)
         assert tracks[0].score < 1
 

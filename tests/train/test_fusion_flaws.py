@@ -123,12 +123,26 @@ def test_noise_is_drawn_between_its_bounds_where_flaws_are_allowed():
     np.testing.assert_allclose(plain, 0.002 * jax.random.normal(KEYS[0], POINTS.shape), rtol=1e-6)
 
 
-def test_clouds_without_these_flaws_are_as_they_were_and_with_them_are_not():
-    """Keys of their own: what else is drawn of a cloud stays."""
+def views() -> tuple[jax.Array, jax.Array]:
+    """Of a ball of radius 0.4, as shards hold them."""
     rng = np.random.default_rng(0)
     outward = rng.normal(size=(VIEWS, 64, 3))
     outward /= np.linalg.norm(outward, axis=-1, keepdims=True)
-    seen = jnp.asarray(0.4 * outward, jnp.float16), jnp.asarray(np.rint(127 * outward), jnp.int8)
+    return jnp.asarray(0.4 * outward, jnp.float16), jnp.asarray(np.rint(127 * outward), jnp.int8)
+
+
+def test_points_of_a_scan_get_no_further_flaws():
+    every = dict.fromkeys((f"{flaw}_probability" for flaw in ("augment", "junk", "drift", "fused")), 1.0)
+    config = dataclasses.replace(CONFIG, noise=0.1, **every)
+    for scanned, least, most in ((True, 0.0, 2e-3), (False, 0.05, 9.0)):
+        points, _, mask = partial_cloud(KEYS[3], views(), views(), config, 64, scanned)
+        off = np.abs(np.linalg.norm(points, axis=-1) - 0.4)[mask].max()
+        assert least <= off < most
+
+
+def test_clouds_without_these_flaws_are_as_they_were_and_with_them_are_not():
+    """Keys of their own: what else is drawn of a cloud stays."""
+    seen = views()
     small = dataclasses.replace(
         CONFIG,
         drift_probability=1.0,

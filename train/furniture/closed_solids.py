@@ -37,6 +37,15 @@ class Solid:
 def canonical(vertices: Float[np.ndarray, "v 3"]) -> tuple[Float[np.ndarray, "v 3"], float]:
     """Bounding box centered at the origin, longest edge 0.9; and source units per canonical unit.
 
+    Raises ValueError as `canonical_frame`.
+    """
+    center, scale = canonical_frame(vertices)
+    return (vertices - center) / scale, scale
+
+
+def canonical_frame(vertices: Float[np.ndarray, "v 3"]) -> tuple[Float[np.ndarray, " 3"], float]:
+    """Center of the bounding box, and source units per canonical unit.
+
     Raises ValueError if there are no vertices, or their extent is zero or not finite.
     """
     if not len(vertices):
@@ -45,7 +54,7 @@ def canonical(vertices: Float[np.ndarray, "v 3"]) -> tuple[Float[np.ndarray, "v 
     scale = float((high - low).max()) / 0.9
     if not np.isfinite(scale) or scale <= 0:
         raise ValueError(f"extent {high - low}; needed a shape with some")
-    return (vertices - (low + high) / 2) / scale, scale
+    return (low + high) / 2, scale
 
 
 def watertight(

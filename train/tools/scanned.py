@@ -9,14 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from itertools import islice
 from pathlib import Path
 
 import numpy as np
 from rich.progress import track
 
-from more2_jax.geometry.poses import Points, apply_pose
-from train.furniture.closed_solids import canonical
+from more2_jax.geometry.poses import Pose, apply_pose
+from more2_jax.types import Instance
+from train.furniture.closed_solids import canonical, canonical_frame
 from train.furniture.source_mesh import name_digest
 from train.rooms.scene_files import read_scene
 from train.rooms.visits import FlyingScene, TrueObject
@@ -50,19 +50,19 @@ def main(rooms: tuple[Path, ...], out: Path, most: int | None = None, sizes: Siz
     scenes = [s for folder in rooms for s in sorted(folder.glob("scene_????"))]
     if not scenes:
         raise ValueError(f"{', '.join(map(str, rooms))}: no scenes; `python -m train.synthesize` makes them")
-    rows: list[dict[str, np.ndarray]] = []
+    queries: dict[str, dict[str, np.ndarray]] = {}  # by model
+    masks: dict[str, list[dict[str, np.ndarray]]] = {}
     credits: dict[str, dict[str, str]] = {}
-    queries: dict[str, dict[str, np.ndarray]] = {}
     for folder in track(scenes, description="rooms"):
         scene = read_scene(folder)
         for o in scene.objects:
             if o.model not in queries:
                 queries[o.model] = model_queries(o, sizes.queries)
-            known = queries[o.model]
-            taken = sum(r["sdf_near"] is known["sdf_near"] for r in rows)
-            left = None if most is None else max(0, most - taken)
-            rows += [known | seen for seen in islice(masks_of(scene, o, sizes), left)]
+            masks[o.model] = [*masks.get(o.model, []), *masks_of(scene, o, sizes)][:most]
             credits[o.model] = {"name": o.model, "source": o.source, "license": o.license}
+    rows = [queries[model] | mask for model, of_model in masks.items() for mask in of_model]
+    if not rows:
+        raise ValueError(f"{len(scenes)} scenes, no mask of {FEWEST_POINTS} points with normals; needed some")
     out.parent.mkdir(parents=True, exist_ok=True)
     write_shapes(out, {"train": stacked(rows)})
     write_credits(out.with_suffix(".credits.tsv"), list(credits.values()))
@@ -84,32 +84,31 @@ def model_queries(o: TrueObject, count: int) -> dict[str, np.ndarray]:
 
 
 def masks_of(scene: FlyingScene, o: TrueObject, sizes: Sizes) -> Iterator[dict[str, np.ndarray]]:
-    """Views and normals of each mask that is mostly the object's."""
-    for k, T_scan_model in o.T_scan_model.items():
+    """Views and normals of each mask that is mostly the object's and has enough points in the box."""
+    for k in sorted(set(o.T_scan_model) - o.merged):
         own = set(o.parts.get(k, ())) | {o.instance.get(k, -1)}
-        if k in o.merged:
-            continue
         for mask in (i for i in scene.scans[k].instances if i.id in own):
-            if mask.normals is not None:
-                points = apply_pose(np.linalg.inv(T_scan_model), np.asarray(mask.points, np.float64))
-                normals = np.asarray(mask.normals, np.float64) @ T_scan_model[:3, :3]
-                yield from views_of(o, points, normals, sizes, name_digest(f"{scene.name} {k} {mask.id}"))
+            seed = name_digest(f"{scene.name} {k} {mask.id}") % 2**32
+            views = views_of(o, o.T_scan_model[k], mask, sizes, np.random.default_rng(seed))
+            if views is not None:
+                yield views
 
 
 def views_of(
-    o: TrueObject, points: Points, normals: Points, sizes: Sizes, seed: int
-) -> Iterator[dict[str, np.ndarray]]:
-    """Random parts of one mask, canonical units of its model; none where too little lies in the box."""
-    _, scale = canonical(np.asarray(o.vertices, np.float64))
-    low, high = o.vertices.min(axis=0), o.vertices.max(axis=0)
-    points = (points - (low + high) / 2) / scale
+    o: TrueObject, T_scan_model: Pose, mask: Instance, sizes: Sizes, rng: np.random.Generator
+) -> dict[str, np.ndarray] | None:
+    """Random parts of one mask, canonical units of its model; None without normals, or of few points in the box."""
+    if mask.normals is None:
+        return None
+    center, scale = canonical_frame(np.asarray(o.vertices, np.float64))
+    points = (apply_pose(np.linalg.inv(T_scan_model), np.asarray(mask.points, np.float64)) - center) / scale
+    normals = np.asarray(mask.normals, np.float64) @ T_scan_model[:3, :3]
     held = np.flatnonzero((np.abs(points) < HALF).all(axis=1))
     if len(held) < FEWEST_POINTS:
-        return
-    rng = np.random.default_rng(seed % 2**32)
+        return None
     rows = np.stack([np.resize(rng.permutation(held), sizes.points) for _ in range(sizes.views)])
     steps = np.rint(NORMAL_STEPS * normals[rows]).astype(np.int8)
-    yield {"views": points[rows].astype(np.float16), "normals": steps}
+    return {"views": points[rows].astype(np.float16), "normals": steps}
 
 
 if __name__ == "__main__":

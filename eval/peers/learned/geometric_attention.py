@@ -12,11 +12,9 @@ from more2_jax.network.vector_neurons import nearest_points
 
 WIDTH, HEADS = 64, 4  # published: 256, 4
 NEAREST = 3  # superpoints that angles are taken with, as published
-DISTANCE, ANGLE = (
-    0.2,
-    15 * jnp.pi / 180,
-)  # what a wave's phase is counted in: cloud radii; radians, as published
-FAR = 1e9
+# What a wave's phase is counted in: cloud radii; radians, as published.
+DISTANCE, ANGLE = 0.2, 15 * jnp.pi / 180
+FAR = 1e9  # taken off scores of what is not there
 
 
 def waves(x: Float[Array, "*b"], features: int = WIDTH) -> Float[Array, "*b features"]:

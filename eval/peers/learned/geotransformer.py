@@ -16,7 +16,7 @@ import optax
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
-from eval.peers.learned.geometric_attention import WIDTH, Attention, Geometry
+from eval.peers.learned.geometric_attention import FAR, WIDTH, Attention, Geometry
 from eval.peers.learned.local_to_global import local_to_global, mutual
 from eval.peers.learned.pair_features import Oriented, oriented, pair_features
 from eval.peers.learned.patches import SUPERPOINTS, Patches, overlap, patches_of
@@ -29,7 +29,6 @@ PAIRS = 24  # of patches; published: 128 in training, 256 after it
 TEMPERATURE = 0.1  # of superpoints' cosines
 SINKHORN_STEPS = 20  # published: 100
 PARTNER = 0.15  # a point has a partner where the other cloud is nearer than this, in its radii
-FAR = 1e9
 
 
 class PointNetwork(nn.Module):

@@ -13,7 +13,7 @@ import numpy as np
 from jax import Array
 from jaxtyping import Bool, Float
 
-from eval.peers.end_to_end import Stages
+from eval.peers.end_to_end import REJECT, Stages
 from eval.peers.learned.clouds import centered, thinned
 from eval.peers.learned.occupancy_mesh import surface
 from eval.peers.learned.registry import TASKS, Params, Trained, load, of_task
@@ -58,6 +58,7 @@ def learned_stages(given: tuple[str, ...], upright: bool) -> dict[str, Stages]:
         match=partial(by_code, matcher),
         register=partial(fit_gicp, registrar, upright=upright),
         surface=partial(surface, surfacer),
+        reject=REJECT,  # codes tell no distance, so matching rejects nothing
     )
     return {" + ".join((matcher.peer.title, registrar.peer.title, "GICP", surfacer.peer.title)): stages}
 
@@ -121,9 +122,8 @@ def fit_gicp(trained: Trained, source: Points, target: Points, upright: bool) ->
     found = by_network(trained, source, target, upright)
     if found is None:
         return None
-    start = (
-        found.copy()
-    )  # as `best_fit` takes it: between clouds about their means, in the target's diagonals
+    # As `best_fit` takes it: between clouds about their means, in the target's diagonals.
+    start = found.copy()
     R, means = found[:3, :3], (source.mean(axis=0), target.mean(axis=0))
     start[:3, 3] = (found[:3, 3] + R @ means[0] - means[1]) / diagonal(target)
     return best_fit(source, target, [start])
