@@ -1,7 +1,7 @@
 """What one would make a surface of an object's points with instead: Poisson, ball pivoting, alpha shapes (Open3D).
 
-Each takes accumulated points (meters) and returns a mesh in their frame, or None where it finds no triangle. None of
-them closes what was not seen.
+Each takes accumulated points (meters) and returns a mesh in their frame, or None where it finds no triangle. Only
+the mirror image completes what was not seen.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from scipy.spatial import KDTree
 
 from eval.harness.extra import library
 from eval.peers.features import diagonal, open3d_cloud
+from eval.peers.mirror_image import with_mirror_image
 from more2_jax.geometry.poses import Points
 from more2_jax.types import Mesh
 
@@ -75,6 +76,11 @@ def alpha_shape(points: Points) -> Mesh | None:
     )
 
 
+def mirrored(points: Points) -> Mesh | None:
+    """Ball pivoting of the points and their mirror image: completion without learning."""
+    return ball_pivoting(with_mirror_image(points))
+
+
 def in_meters(mesh: Any, unit: float, center: Float[np.ndarray, "3"]) -> Mesh | None:
     """The mesh back in the points' frame; None without a triangle."""
     faces = np.asarray(mesh.triangles)
@@ -87,4 +93,5 @@ SURFACERS: dict[str, Surfacer] = {
     "screened Poisson, cropped": poisson,
     "ball pivoting": ball_pivoting,
     "alpha shape": alpha_shape,
+    "mirror image + ball pivoting": mirrored,
 }

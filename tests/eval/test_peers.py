@@ -7,7 +7,7 @@ from known_scenes import pose
 
 from eval.harness.extra import has, library
 from eval.peers import matching, registration
-from more2_jax.geometry.poses import rotation_error_deg
+from more2_jax.geometry.poses import apply_pose, rotation_error_deg
 from more2_jax.types import Instance
 
 need = pytest.mark.skipif(not (has("open3d") and has("small_gicp")), reason="extra peers is not installed")
@@ -17,6 +17,16 @@ def odd_shape(count, seed, size=(1.0, 0.5, 0.3)):
     arm = trimesh.creation.box((0.1, 0.7, 0.9), transform=pose(0, [0.5, 0.3, 0.4]))
     mesh = trimesh.util.concatenate([trimesh.creation.box(size), arm])
     return np.asarray(trimesh.sample.sample_surface(mesh, count, seed=seed)[0])
+
+
+def bench_points():
+    """Of a seat, a back and two legs; its own mirror image in x = 0 alone."""
+    boxes = [(1, 0.6, 0.1), (1, 0.05, 0.8), (0.1, 0.1, 0.6), (0.1, 0.1, 0.6)]
+    at = [(0, 0, 0), (0, 0.3, 0.4), (0.4, -0.2, -0.35), (-0.4, -0.2, -0.35)]
+    mesh = trimesh.util.concatenate(
+        [trimesh.creation.box(b, transform=pose(0, t)) for b, t in zip(boxes, at, strict=True)]
+    )
+    return np.asarray(trimesh.sample.sample_surface(mesh, 6000, seed=0)[0])
 
 
 SOURCE, TARGET = odd_shape(3000, 0), odd_shape(3000, 1)
@@ -99,7 +109,9 @@ def test_rejected_pairs_are_none():
 
 
 @need
-@pytest.mark.parametrize("name", ["screened Poisson, cropped", "ball pivoting", "alpha shape"])
+@pytest.mark.parametrize(
+    "name", ["screened Poisson, cropped", "ball pivoting", "alpha shape", "mirror image + ball pivoting"]
+)
 def test_surfaces_of_a_whole_cloud_lie_on_it(name):
     from eval.peers.reconstruction import SURFACERS
 
@@ -109,6 +121,31 @@ def test_surfaces_of_a_whole_cloud_lie_on_it(name):
     found = np.asarray(trimesh.sample.sample_surface(solid, 2000, seed=0)[0])
     distance = np.linalg.norm(found[:, None] - (SOURCE + 4)[None], axis=-1).min(axis=1)
     assert np.median(distance) < 0.03
+
+
+@need
+def test_the_mirror_image_completes_a_bench_of_which_one_end_was_not_seen():
+    from scipy.spatial import KDTree
+
+    from eval.peers.mirror_image import with_mirror_image
+
+    whole = bench_points()
+    T = pose(40, [3, 1, 2], "x")
+    unseen = whole[:, 0] >= 0.3
+    seen, missing = (apply_pose(T, x) for x in (whole[~unseen], whole[unseen]))
+    completed = with_mirror_image(seen)
+    np.testing.assert_array_equal(completed[: len(seen)], seen)
+    before, after = (KDTree(x).query(missing)[0].mean() for x in (seen, completed))
+    assert after < 0.7 * before
+    assert KDTree(apply_pose(T, whole)).query(completed[len(seen) :])[0].mean() < 0.04
+
+
+@need
+def test_a_cloud_that_is_no_mirror_image_of_itself_stays_as_it_is():
+    from eval.peers.mirror_image import with_mirror_image
+
+    scattered = np.random.default_rng(0).normal(size=(400, 3)) * [3.0, 2.0, 1.0]
+    np.testing.assert_array_equal(with_mirror_image(scattered), scattered)
 
 
 @need
