@@ -9,7 +9,8 @@ import numpy as np
 from jaxtyping import Float, Int
 from plyfile import PlyData, PlyElement
 
-from more2_jax.scans.files.ply_cloud import read_ply
+from more2_jax.scans.files.ply_cloud import cloud_of, read_elements, read_ply
+from more2_jax.scans.files.ply_faces import face_corners
 from more2_jax.types import Mesh
 
 NORMAL = ("nx", "ny", "nz")
@@ -66,8 +67,9 @@ def write_mesh(path: Path, mesh: Mesh) -> None:
 
 def read_mesh(path: Path) -> Mesh:
     """Reads a triangle mesh. Raises ValueError if the file is damaged or has other polygons."""
-    vertices = read_ply(path).points
-    rows = list(PlyData.read(str(path), mmap=False)["face"].data["vertex_indices"])  # type: ignore[arg-type]
-    if any(len(row) != 3 for row in rows):
+    elements = read_elements(path)
+    vertices = cloud_of(path, elements).points
+    corners, face = face_corners(path, elements, len(vertices))
+    if len(corners) % 3 or (face != np.arange(len(corners)) // 3).any():
         raise ValueError(f"{path}: faces of other than three corners; needed triangles")
-    return Mesh(vertices=vertices, faces=np.array(rows, np.int32).reshape(-1, 3))
+    return Mesh(vertices=vertices, faces=corners.astype(np.int32).reshape(-1, 3))

@@ -14,6 +14,7 @@ from eval.reconstruction import JOINT_STEPS, own_names, with_joint
 from eval.scores.mesh_scores import (
     DISTANCES,
     SHARES,
+    all_to_surface,
     enclosed,
     f_score,
     mesh_scores,
@@ -160,9 +161,11 @@ def test_iou_of_shifted_boxes_by_inside_tests():
 def test_sdf_recall_of_a_plane_at_known_heights():
     plane = trimesh.Trimesh([[-9, -9, 0], [9, -9, 0], [9, 9, 0], [-9, 9, 0]], [[0, 1, 2], [0, 2, 3]])
     heights = np.array([[0, 0, 0.0], [1, 1, 0.04], [2, 0, -0.04], [0, 2, 0.06], [1, 0, -0.2]])
-    assert sdf_recall(heights, plane, 0.05) == pytest.approx(3 / 5)
-    assert sdf_recall(heights, plane, threshold=1.0) == 1
-    assert sdf_recall(heights + [0, 0, 5], plane, 0.05) == 0
+    near, far = all_to_surface((heights, heights + [0, 0, 5]), plane)
+    np.testing.assert_allclose(near, np.abs(heights[:, 2]), atol=1e-9)
+    assert sdf_recall(near, 0.05) == pytest.approx(3 / 5)
+    assert sdf_recall(near, threshold=1.0) == 1
+    assert sdf_recall(far, 0.05) == 0
 
 
 def test_f1():
