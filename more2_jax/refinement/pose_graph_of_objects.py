@@ -62,10 +62,12 @@ def with_poses_refined(
 ) -> list[AccumulatedObject]:
     """A few of the objects with poses that agree: what planes and batches take of memory does not grow with a scene."""
     result = list(objects)
+    several = [n for n, o in enumerate(objects) if len(o.poses) > 1]  # one observation agrees with itself
     with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
-        surfaces = list(pool.map(lambda o: list(observation_surfaces(prior, o, config)), objects))
+        found = pool.map(lambda n: list(observation_surfaces(prior, objects[n], config)), several)
+        surfaces = dict(zip(several, found, strict=True))
     batches: dict[int, list[int]] = defaultdict(list)  # by the number of observations, padded
-    for n, row in enumerate(surfaces):
+    for n, row in surfaces.items():
         batches[bucket(len(row), MIN_OBSERVATIONS)].append(n)
     for count, rows in batches.items():
         batch = oriented_batch([surfaces[n] for n in rows], count)
