@@ -47,7 +47,6 @@ from train.run.program import run
 
 RIDGE = 1e-6  # keeps weights finite where the rooms are told apart without a mistake
 SIGN = {"likeness": 1.0}  # the only evidence that speaks for a pair; all other speaks against it
-TAKEN_AWAY = 0.25  # share of objects and of instances, to see what rejection costs
 TIMES = 8  # that they are taken away anew
 
 
@@ -76,6 +75,7 @@ def main(
     visits: int = 2,
     scenes: int = 0,
     masks: tuple[Masks, ...] = ("true",),
+    taken_away: float = 0.25,
     out: Path | None = None,
 ) -> None:
     """Fits the log odds of pairs of scans (first and every later one) and says how well they hold.
@@ -86,8 +86,11 @@ def main(
         visits: scans of a room that take part, from the first; 0 for all.
         scenes: rooms of a folder, from the first; 0 for all.
         masks: true, or damaged on purpose; every room is seen through each of them.
+        taken_away: share of the objects and of the instances that go at random, to see what rejection costs.
         out: folder of the reliability curves, reliability.png and .svg; needs matplotlib.
     """
+    if not 0 <= taken_away < 1:
+        raise ValueError(f"taken away {taken_away:g}; needed a share, 0 or more and less than 1")
     rooms = [flyingshape(folder) for folder in data]
     if len({r.upright for r in rooms}) != 1:
         raise ValueError(
@@ -102,7 +105,7 @@ def main(
             pairs += [p for s in seen for p in scan_pairs(f"{folder}/{name}", s, weights, config)]
     if not pairs:
         raise ValueError(f"{', '.join(map(str, data))}: no room with two scans; needed one")
-    report(pairs, asked(config), config)
+    report(pairs, asked(config), taken_away)
     curves = reliability_curves(pairs, asked(config))
     Console(width=120).print(*(reliability_table(name, curve) for name, curve in curves.items()))
     if out is not None:
@@ -204,27 +207,18 @@ def log_loss(odds: Float[np.ndarray, " p"], one: Bool[np.ndarray, " p"]) -> floa
     return float(np.logaddexp(0.0, np.where(one, -odds, odds)).mean())
 
 
-def report(pairs: Sequence[ScanPair], named: dict[str, Calibration], config: SceneConfig) -> None:
+def report(pairs: Sequence[ScanPair], named: dict[str, Calibration], taken_away: float) -> None:
     """Prints the fitted weights and how well the shipped and the fitted ones tell who is who."""
     console = Console(width=120)
-    table = Table(
-        "weights",
-        "added",
-        "log loss",
-        "off by",
-        "recall",
-        "precision",
-        "a quarter gone: recall",
-        "precision",
-        "F1",
-    )
+    gone = (f"{taken_away:.0%} gone: recall", "precision", "F1", "changes' F1")
+    table = Table("weights", "added", "log loss", "off by", "recall", "precision", "changes' F1", *gone)
     several = len({p.room for p in pairs}) > 1
     for name, shipped in named.items():
-        add_row(table, f"{name}, shipped", "", pairs, {p.room: shipped for p in pairs})
+        add_row(table, f"{name}, shipped", pairs, {p.room: shipped for p in pairs}, taken_away)
         by_room = left_out(pairs, shipped) if several else {}
         for added in (0.0, 1.0, 2.0, 3.0) if several else ():
             raised = {k: replace(c, intercept=c.intercept + added, raised=added) for k, c in by_room.items()}
-            add_row(table, f"{name}, fitted, rooms left out in turn", f"{added:g}", pairs, raised)
+            add_row(table, f"{name}, fitted, rooms left out in turn", pairs, raised, taken_away)
         weights = {k: round(v, 2) for k, v in asdict(fitted(pairs, shipped)).items() if v}
         console.print(f"{name}, fitted on all: {weights}")
     count, one = sum(p.among.sum() for p in pairs), sum(p.one[p.among].sum() for p in pairs)
@@ -233,16 +227,24 @@ def report(pairs: Sequence[ScanPair], named: dict[str, Calibration], config: Sce
 
 
 def add_row(
-    table: Table, name: str, added: str, pairs: Sequence[ScanPair], by_room: dict[str, Calibration]
+    table: Table,
+    name: str,
+    pairs: Sequence[ScanPair],
+    by_room: dict[str, Calibration],
+    taken_away: float,
 ) -> None:
     """One way to weigh."""
+    added = next(iter(by_room.values())).raised
     odds = [p.odds(by_room[p.room]) for p in pairs]
     told = np.concatenate([o[p.among] - by_room[p.room].raised for o, p in zip(odds, pairs, strict=True)])
     one = np.concatenate([p.one[p.among] for p in pairs])
-    whole = counts([(o, p.one) for o, p in zip(odds, pairs, strict=True)])
-    fewer = counts(thinned(odds, pairs))
-    shares = [f"{100 * x:.1f} %" for x in (*whole[:2], *fewer)]
-    table.add_row(name, added, f"{log_loss(told, one):.3f}", f"{calibration_error(told, one):.3f}", *shares)
+    whole = [(o, p.one) for o, p in zip(odds, pairs, strict=True)]
+    fewer = thinned(odds, pairs, taken_away)
+    told_apart = (*counts(whole)[:2], changes_f1(whole), *counts(fewer), changes_f1(fewer))
+    shares = [f"{100 * x:.1f} %" for x in told_apart]
+    table.add_row(
+        name, f"{added:g}", f"{log_loss(told, one):.3f}", f"{calibration_error(told, one):.3f}", *shares
+    )
 
 
 def reliability_curves(pairs: Sequence[ScanPair], named: dict[str, Calibration]) -> dict[str, list[Bin]]:
@@ -268,14 +270,14 @@ def reliability_table(name: str, curve: Sequence[Bin]) -> Table:
 
 
 def thinned(
-    odds: Sequence[Float[np.ndarray, "n m"]], pairs: Sequence[ScanPair]
+    odds: Sequence[Float[np.ndarray, "n m"]], pairs: Sequence[ScanPair], taken_away: float
 ) -> list[tuple[np.ndarray, np.ndarray]]:
     """Log odds and truth with a share of the objects and of the instances taken away at random."""
     rng = np.random.default_rng(0)
     found = []
     for o, p in zip(odds, pairs, strict=True):
         for _ in range(TIMES):
-            kept = np.ix_(*(rng.random(n) >= TAKEN_AWAY for n in o.shape))
+            kept = np.ix_(*(rng.random(n) >= taken_away for n in o.shape))
             found.append((o[kept], p.one[kept]))
     return found
 
@@ -287,6 +289,18 @@ def counts(rooms: Sequence[tuple[np.ndarray, np.ndarray]]) -> tuple[float, float
         pairs = assigned(odds)
         right, said, true = right + one[tuple(pairs.T)].sum(), said + len(pairs), true + most(one)
     return right / max(true, 1), right / max(said, 1), 2 * right / max(said + true, 1)
+
+
+def changes_f1(rooms: Sequence[tuple[np.ndarray, np.ndarray]]) -> float:
+    """Mean over rooms of the F1 of what came or went; 1 where nothing did and nothing is said to have."""
+    found = []
+    for odds, one in rooms:
+        pairs = assigned(odds)
+        said = np.concatenate([~np.isin(np.arange(n), pairs[:, side]) for side, n in enumerate(one.shape)])
+        true = np.concatenate([~one.any(axis=1), ~one.any(axis=0)])
+        either = said.sum() + true.sum()
+        found.append(2 * (said & true).sum() / either if either else 1.0)
+    return float(np.mean(found))
 
 
 def most(one: Bool[np.ndarray, "n m"]) -> int:

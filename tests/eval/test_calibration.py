@@ -11,6 +11,7 @@ from scipy.special import expit
 
 from eval.calibration import (
     ScanPair,
+    changes_f1,
     counts,
     fitted,
     labels,
@@ -110,9 +111,19 @@ def test_recall_precision_and_f1_of_assignments_by_hand():
     assert (recall, precision, f1) == pytest.approx((2 / 3, 2 / 3, 2 / 3))
 
 
+def test_f1_of_what_came_or_went_by_hand():
+    one = np.array([[True, False], [False, False], [False, False]])  # two objects went, one instance came
+    odds = np.array([[2.0, -1], [-1, 1], [-1, -1]])  # one is said to have gone
+    assert changes_f1([(odds, one)]) == pytest.approx(2 * 1 / (1 + 3))
+    nothing = np.eye(2, dtype=bool)
+    assert changes_f1([(np.where(nothing, 1.0, -1.0), nothing)]) == 1
+    assert changes_f1([(np.full((2, 2), -1.0), nothing)]) == 0
+    assert changes_f1([(odds, one), (np.full((2, 2), -1.0), nothing)]) == pytest.approx(0.25)
+
+
 def test_thinned_rooms_are_parts_of_the_rooms_and_not_all_the_same():
     pair = drawn("a", 30, 0)
-    parts = thinned([pair.odds(PLANTED)], [pair])
+    parts = thinned([pair.odds(PLANTED)], [pair], 0.25)
     assert len({o.shape for o, _ in parts}) > 1
     for odds, one in parts:
         assert odds.shape == one.shape
@@ -171,6 +182,12 @@ def test_a_line_a_bin():
         ["0.250", "1.000"],
         ["8", "2"],
     ]
+
+
+@pytest.mark.parametrize("share", [-0.1, 1.0])
+def test_a_share_that_leaves_nothing_is_refused(tmp_path, share):
+    with pytest.raises(ValueError, match="needed a share"):
+        main((tmp_path,), taken_away=share)
 
 
 def test_rooms_of_two_kinds_are_refused(tmp_path, monkeypatch):
