@@ -24,7 +24,7 @@ from more2_jax.refinement.pose_graph_of_objects import refine_object_poses
 from more2_jax.tracking.accumulated import accumulated_objects, embed_accumulated, readable, with_refined
 from more2_jax.tracking.changes import changes_between, forgotten, not_seen_in
 from more2_jax.tracking.comparison import Comparison
-from more2_jax.tracking.identify import Found, Identified, identify
+from more2_jax.tracking.identify import Found, Identified, identify, with_left_over
 from more2_jax.tracking.joined_masks import join_parts
 from more2_jax.tracking.leveling import as_given, level_of, leveled, shows_floor
 from more2_jax.tracking.looked_at import not_looked_at
@@ -121,7 +121,8 @@ def who_is_who(
             compared = Comparison.of(prior, [o for o, _ in old], new, identified, config)
             mended = compared and mend(masks, compared)
             known = compare(mended) if mended else known
-        return known
+        masks, old, new, identified = known
+        return masks, old, new, with_left_over(identified, [o for o, _ in old], new, config)
 
 
 def add_scan(

@@ -100,7 +100,7 @@ def interchangeable(odds: LogOdds, pairs: Chosen) -> list[bool]:
         defaultdict[int, dict[int, float]](dict),
     )
     for (k, i), z in zip(odds.pairs.tolist(), odds.value.tolist(), strict=True):
-        if z > 0:
+        if z > 0 or object_of.get(i) == k:
             of_object[k][i] = of_instance[i][k] = z
 
     def exchanged(k: int, i: int) -> bool:

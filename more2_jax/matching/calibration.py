@@ -66,13 +66,13 @@ UPRIGHT = Calibration(
     raised=2.25,
 )
 FREE = Calibration(
-    intercept=8.7,
+    intercept=7.7,
     likeness=3.0,
     apart_less=-7.1,
     apart_more=-1.3,
     off_less=-10.0,
     off_more=-11.2,
-    raised=3.5,
+    raised=2.5,
 )
 # Without the prior's say.
 UNASKED = Calibration(intercept=3.7, likeness=5.8, apart_less=-6.3, apart_more=-6.1, raised=3.0)

@@ -11,16 +11,29 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from more2_jax.config import MotionModel
 from more2_jax.geometry.normalized_cut import Rows
 from more2_jax.matching.assignment import NEVER
 from more2_jax.types import Embedding
 
 # Chosen on rooms of regime `real`, docs/developing/notebook/mask_repair.md.
 SAME_SIZE = 0.8  # |log| of the ratio of the F_s: a half that differs more from every object is not compared
-# Log odds that the halves must have beyond the whole, for most masks hold one object: where the halves hardly touch,
-LEAST_GAIN_NARROW = 2.2
-LEAST_GAIN = 4.0  # and elsewhere, where both must be known
 SURE = 7.5  # log odds of a whole that is not divided: clean pairs of one object have 5 to 8
+
+
+@dataclass(frozen=True, kw_only=True)
+class LeastGain:
+    """Log odds that halves must have beyond the whole, for most masks hold one object."""
+
+    narrow: float  # where the halves hardly touch,
+    wide: float  # and elsewhere, where both must be known
+
+
+# In any orientation more fits by chance.
+LEAST_GAIN: dict[MotionModel, LeastGain] = {
+    "upright": LeastGain(narrow=2.2, wide=4.0),
+    "free": LeastGain(narrow=3.8, wide=5.9),
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,6 +68,7 @@ class Wholes:
     left: Sequence[int]  # rows of the other scan's clouds that nothing was found to be
     scale: Sequence[float]  # F_s of the other scan's clouds
     odds: Mapping[int, float]  # log odds of a cloud with its partner
+    least: LeastGain  # of its divisions
 
     def in_doubt(self, whole: int) -> bool:
         """Whether a division of the cloud could say what those left are."""
@@ -92,19 +106,22 @@ def chosen(halves: Sequence[tuple[Part, Part]], wholes: Wholes, weigh: Weigh) ->
                     for side, p in enumerate(pair)
                 ],
                 wholes.gained(pair[0].whole),
+                wholes.least,
             )
         ]
     )
 
 
-def proposals(pair: tuple[Part, Part], odds: Sequence[Mapping[int, float]], gained: float) -> list[Division]:
+def proposals(
+    pair: tuple[Part, Part], odds: Sequence[Mapping[int, float]], gained: float, least: LeastGain
+) -> list[Division]:
     """What two halves may be, where that gains enough. `odds`: of each with what it may be."""
     fits = [{None: 0.0} | {k: o for k, o in of_half.items() if o > 0} for of_half in odds]
     found = []
     for first, second in itertools.product(*fits):
         gain = fits[0][first] + fits[1][second] - gained
         both = first is not None and second is not None
-        enough = gain > LEAST_GAIN_NARROW if pair[0].narrow else both and gain > LEAST_GAIN
+        enough = gain > least.narrow if pair[0].narrow else both and gain > least.wide
         if enough and first != second:
             found.append(Division(parts=pair, others=(first, second), gain=gain))
     return found

@@ -10,9 +10,9 @@ from jaxtyping import Float
 
 from more2_jax.config import CodeMatcher, EvidenceMatcher, SceneConfig
 from more2_jax.geometry.poses import apply_pose
-from more2_jax.matching.assignment import assign, interchangeable, unmatched
+from more2_jax.matching.assignment import Chosen, LogOdds, assign, interchangeable, unmatched
 from more2_jax.matching.calibration import probability
-from more2_jax.matching.candidates import AlignedPairs
+from more2_jax.matching.candidates import AlignedPairs, odds_of
 from more2_jax.matching.code_assignment import match_instances
 from more2_jax.network.embedding_batch import stack
 from more2_jax.network.prior import Prior
@@ -22,6 +22,9 @@ from more2_jax.tracking.scan_height import Rooms
 from more2_jax.types import Frame, ObservedObject
 
 NO_ROOMS = Rooms()
+# Of log odds, in any orientation, for pairs of what is left over: objects stay more often than the weights were fitted
+# for, docs/developing/notebook/matching_any_orientation.md.
+LEFT_OVER = 1.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,19 +84,53 @@ def by_evidence(
 ) -> Identified:
     """The assignment that surfaces find likeliest, with probabilities, and the frame of the scan."""
     frame, weighed = common_frame(prior, old, new, matcher, config.motion, rooms)
-    odds = weighed.odds
-    there = apply_pose(frame.T_scene_scan, centers(new))
+    pairs = assign(weighed.odds, moved_m(weighed.odds, old, new, frame), matcher.motion_weight)
+    return as_told(weighed.odds, pairs, frame, weighed.aligned, config)
+
+
+def with_left_over(
+    identified: Identified, old: Sequence[ObservedObject], new: Sequence[ObservedObject], config: SceneConfig
+) -> Identified:
+    """In any orientation: the same with pairs of what was left over that are nearly as likely one object as not.
+
+    To be asked when masks are mended: until then, what is left over shows which masks to mend.
+    """
+    aligned, frame = identified.aligned, identified.frame
+    if aligned is None or config.motion != "free" or not isinstance(config.matching, EvidenceMatcher):
+        return identified
+    odds = odds_of(aligned, config.matching.search, config.motion)
     k, i = odds.pairs.T
-    moved_m = np.linalg.norm(centers(old)[k] - there[i], axis=-1)
-    pairs = assign(odds, moved_m, matcher.motion_weight)
+    rows = np.isin(k, list(identified.gone)) & np.isin(i, list(identified.new))
+    left = LogOdds(pairs=odds.pairs[rows], value=odds.value[rows] + LEFT_OVER, shape=odds.shape)
+    more = assign(left, moved_m(left, old, new, frame), config.matching.motion_weight)
+    if not len(more):
+        return identified
+    found = np.array([(f.object, f.instance) for f in identified.found], int).reshape(-1, 2)
+    pairs = np.concatenate([found, more])
+    return as_told(odds, pairs[np.lexsort(pairs.T[::-1])], frame, aligned, config)
+
+
+def as_told(
+    odds: LogOdds, pairs: Chosen, frame: Frame, aligned: AlignedPairs, config: SceneConfig
+) -> Identified:
+    """An assignment with its probabilities."""
+    assert isinstance(config.matching, EvidenceMatcher)
     copies = interchangeable(odds, pairs)
-    chance = probability(odds.value, matcher.search, config.motion)
+    chance = probability(odds.value, config.matching.search, config.motion)
     gone, fresh = unmatched(odds, chance, pairs)
     found = tuple(
         Found(object=int(k), instance=int(i), score=float(p), interchangeable=c)
         for (k, i), p, c in zip(pairs, chance[odds.rows_of(pairs)], copies, strict=True)
     )
-    return Identified(found=found, gone=gone, new=fresh, frame=frame, aligned=weighed.aligned)
+    return Identified(found=found, gone=gone, new=fresh, frame=frame, aligned=aligned)
+
+
+def moved_m(
+    odds: LogOdds, old: Sequence[ObservedObject], new: Sequence[ObservedObject], frame: Frame
+) -> Float[np.ndarray, " p"]:
+    """How far every listed pair moved, if it is one object."""
+    k, i = odds.pairs.T
+    return np.linalg.norm(centers(old)[k] - apply_pose(frame.T_scene_scan, centers(new))[i], axis=-1)
 
 
 def centers(objects: Sequence[ObservedObject]) -> Float[np.ndarray, "n 3"]:

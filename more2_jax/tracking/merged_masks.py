@@ -19,7 +19,7 @@ from more2_jax.geometry.transform import transform
 from more2_jax.matching.color import color_of
 from more2_jax.network.embedding_batch import embed
 from more2_jax.tracking.comparison import Comparison
-from more2_jax.tracking.divisions import Division, Part, Wholes, chosen
+from more2_jax.tracking.divisions import LEAST_GAIN, Division, Part, Wholes, chosen
 from more2_jax.tracking.objects import place_of
 from more2_jax.tracking.regrouped import Regrouped
 from more2_jax.tracking.room_points import some_points
@@ -75,7 +75,7 @@ def with_instances_divided(whole: Regrouped, divisions: Sequence[Division]) -> R
 def divisions_of_instances(compared: Comparison, instances: Sequence[Instance]) -> list[Division]:
     """Which instances hold two objects that are known apart."""
     partner = {f.instance: f.object for f in compared.identified.found}
-    wholes = wholes_of(partner, compared.old, compared.odds_of_found(1))
+    wholes = wholes_of(compared, partner, compared.old, side=1)
     cuts = {
         i: cuts_of(compared, o.points, compared.object_there(partner[i], i) if i in partner else None)
         for i, o in enumerate(compared.new)
@@ -102,7 +102,7 @@ def divisions_of_instances(compared: Comparison, instances: Sequence[Instance]) 
 def divisions_of_objects(compared: Comparison, objects: Sequence[SceneObject]) -> list[Division]:
     """Which objects, seen once, are two that the new scan shows apart."""
     partner = {f.object: f.instance for f in compared.identified.found}
-    wholes = wholes_of(partner, compared.new, compared.odds_of_found(0))
+    wholes = wholes_of(compared, partner, compared.new, side=0)
     seen_once = [k for k, o in enumerate(objects) if len(o.observations) == 1]
     cuts = {
         k: cuts_of(
@@ -165,11 +165,16 @@ def halves_of(
 
 
 def wholes_of(
-    partner: Mapping[int, int], others: Sequence[ObservedObject], odds: Mapping[int, float]
+    compared: Comparison, partner: Mapping[int, int], others: Sequence[ObservedObject], side: int
 ) -> Wholes:
-    """How the clouds of one scan stand to `others`, those of the other."""
-    left = sorted(set(range(len(others))) - set(partner.values()))
-    return Wholes(partner=partner, left=left, scale=[float(o.embedding.scale) for o in others], odds=odds)
+    """How the clouds of one scan, objects (side 0) or instances (1), stand to `others`, those of the other."""
+    return Wholes(
+        partner=partner,
+        left=sorted(set(range(len(others))) - set(partner.values())),
+        scale=[float(o.embedding.scale) for o in others],
+        odds=compared.odds_of_found(side),
+        least=LEAST_GAIN[compared.config.motion],
+    )
 
 
 def beside_of(whole: Points, points: Points) -> Rows:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from boxes import box, two_boxes
 
-from more2_jax.tracking.divisions import Division, Part, Wholes, chosen, compatible
+from more2_jax.tracking.divisions import LEAST_GAIN, Division, Part, Wholes, chosen, compatible
 from more2_jax.tracking.merged_masks import beside_of, larger_first
 from more2_jax.types import Embedding
 
@@ -34,7 +34,7 @@ def pair(whole=0, narrow=False):
     return tuple(Part(whole=whole, rows=s, embedding=CODE, narrow=narrow) for s in sides)
 
 
-def decided(odds, *, partner=None, now=0.0, narrow=False, scale=(1.0, 1.0, 1.0)):
+def decided(odds, *, partner=None, now=0.0, narrow=False, scale=(1.0, 1.0, 1.0), motion="upright"):
     """What becomes of one mask whose halves have `odds` (others, 2)."""
     odds = np.asarray(odds, float)
     partner = {} if partner is None else {0: partner}
@@ -43,6 +43,7 @@ def decided(odds, *, partner=None, now=0.0, narrow=False, scale=(1.0, 1.0, 1.0))
         left=[k for k in range(len(odds)) if k not in partner.values()],
         scale=scale[: len(odds)],
         odds={0: now},
+        least=LEAST_GAIN[motion],
     )
     return chosen([pair(narrow=narrow)], wholes, lambda _, others: dict(np.ndenumerate(odds[others])))
 
@@ -57,6 +58,7 @@ def test_only_a_mask_whose_halves_could_be_what_is_missing_is_cut(partner, left,
         left=range(1, 1 + left),
         scale=[1.0] * 3,
         odds={0: now},
+        least=LEAST_GAIN["upright"],
     )
     assert wholes.in_doubt(0) == doubt
 
@@ -65,6 +67,14 @@ def test_halves_that_are_two_known_things_are_two():
     (d,) = decided([[3, -5], [-5, 3], [1, 1]])
     assert d.others == (0, 1)
     assert d.gain == pytest.approx(6)
+
+
+@pytest.mark.parametrize(("gain", "narrow"), [(3.0, True), (4.5, False)])
+def test_in_any_orientation_a_division_must_gain_more(gain, narrow):
+    odds = [[gain / 2, -5], [-5, gain / 2]]
+    assert decided(odds, narrow=narrow)
+    assert not decided(odds, narrow=narrow, motion="free")
+    assert decided(np.array(odds) * 2, narrow=narrow, motion="free")
 
 
 @pytest.mark.parametrize(
