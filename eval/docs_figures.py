@@ -48,10 +48,20 @@ FIGURES = {
     "SDF recall": ("SDF recall, objects", "strict"),
     "IoU": ("IoU", "paper"),
     "published IoU": ("IoU", "published"),
+    "AP50 moved": ("AP50, moved", ""),
+    "AP50 moved labeled": ("AP50, moved, labeled", ""),
+    "AP50 all": ("AP50, all", ""),
+    "AP50 all labeled": ("AP50, all, labeled", ""),
+    "recall moved": ("recall, moved", ""),
+    "recall all": ("recall, all", ""),
+    "registration of the pairs": ("registration of the pairs", "processor"),
+    "one room": ("one room", "processor"),
+    "all rooms": ("all rooms", "processor"),
     "time": ("time a scene", ""),
     "time a pair": ("time a pair", ""),
 }
 SENSE = {"higher": 1.0, "lower": -1.0}
+OF_OBJECTS = re.compile(r"eval\.(?:reconstruction|segmentation)\b")  # programs that count objects, not pairs
 OURS = "ours"  # methods whose names begin so
 
 
@@ -152,7 +162,8 @@ def of_methods(kept: dict[str, Any], shown: Sequence[str], only: str = "") -> li
         cells = [cell(r, worth(r) >= most) if r else "" for r, most in found]
         lines.append(row_of([method, *cells]))
     facts = [f"`{kept['command']}`", kept["date"][:10], f"{kept['rows'][0]['scenes']} rooms"]
-    return [*lines, "", f"{', '.join(facts)}, {max(r['count'] for r in kept['rows'])} pairs."]
+    of = "objects" if OF_OBJECTS.search(kept["command"]) else "pairs"
+    return [*lines, "", f"{', '.join(facts)}, {max(r['count'] for r in kept['rows'])} {of}."]
 
 
 def of_several(runs: dict[str, dict[str, Any]], shown: Sequence[str]) -> list[str]:

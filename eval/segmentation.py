@@ -7,10 +7,9 @@ On rooms of regime `real` (`train.synthesize`), their masks removed. The truth i
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -18,9 +17,12 @@ import numpy as np
 import tyro
 from jaxtyping import Bool, Float, Integer
 from rich.console import Console
-from rich.table import Table
 
-from eval.scores.segment_scores import Overlaps, overlaps, segment_scores
+from eval.harness.results import circumstances_now
+from eval.harness.run_folder import write_json
+from eval.harness.tables import on_screen
+from eval.scores.figures import Figure, Record, rows_of
+from eval.scores.segment_scores import SEGMENT_FIGURES, overlaps, segment_records
 from more2_jax.scans.files.json_file import read_json
 from more2_jax.scans.files.npz import read_arrays
 from more2_jax.scans.geometric_segmentation import SegmentationConfig, segment_geometric
@@ -31,6 +33,10 @@ from more2_jax.scans.temporal_segmentation import segment_changes
 from train.run.program import run
 
 LEAST_POINTS = 64  # of an object and of an instance: as `more2 run` has them
+FIGURES = (
+    *SEGMENT_FIGURES,
+    Figure(name="time a scene", key="seconds", statistic="mean", unit="s", better="lower"),
+)
 TRUTH = ("owner", "object", "T_scan_model", "T_scan_room")
 Found = tuple[Integer[np.ndarray, " n"], Float[np.ndarray, " k"]]  # instance of every point, score of each
 
@@ -78,26 +84,30 @@ def main(options: Annotated[Settings, tyro.conf.arg(name="")]) -> None:
         raise ValueError(
             f"{options.data}: no scene_*/scene.json; needed rooms of train.synthesize --regime real"
         )
-    by_method: dict[str, dict[str, list[tuple[str, list[Overlaps], float]]]] = {m: {} for m in METHODS}
-    for folder in folders:
-        frames, visits = read_visits(folder)
-        for method, find in METHODS.items():
-            began = time.process_time()
-            try:
-                found = find(visits)
-            except ValueError:
-                found = [
-                    (np.zeros(len(v.owner), np.int64), np.zeros(0)) for v in visits
-                ]  # refused: no instance
-            seconds = time.process_time() - began
-            scored = [
-                overlaps(*f, v.owner, v.moved, LEAST_POINTS) for f, v in zip(found, visits, strict=True)
-            ]
-            by_method[method].setdefault(frames, []).append((folder.name, scored, seconds))
-    rows = [row for method, groups in by_method.items() for row in _rows(method, groups)]
+    records: dict[str, list[Record]] = {f.name: scored_scene(f) for f in folders}
+    rows = rows_of(FIGURES, records, ("frames",))
     options.out.mkdir(parents=True, exist_ok=True)
-    (options.out / "results.json").write_text(json.dumps(rows, indent=1), encoding="utf-8")
-    Console().print(_table(rows))
+    stated = {"program": "segmentation", "masks": "none", "scenes": len(folders)}
+    told = {**circumstances_now(), "settings": stated, "rows": [asdict(r) for r in rows]}
+    write_json(options.out / "results.json", told)
+    Console().print(on_screen(rows, "Instances without a network"))
+
+
+def scored_scene(folder: Path) -> list[Record]:
+    """Records of both methods on one room, each with how the scans' frames lie."""
+    frames, visits = read_visits(folder)
+    records: list[Record] = []
+    for method, find in METHODS.items():
+        began = time.process_time()
+        try:
+            found = find(visits)
+        except ValueError:  # refused: no instance
+            found = [(np.zeros(len(v.owner), np.int64), np.zeros(0)) for v in visits]
+        own: list[Record] = [{"seconds": time.process_time() - began}]
+        for f, v in zip(found, visits, strict=True):
+            own += segment_records(overlaps(*f, v.owner, v.moved, LEAST_POINTS))
+        records += [{"method": method, "frames": frames, **r} for r in own]
+    return records
 
 
 def read_visits(folder: Path) -> tuple[str, list[Visit]]:
@@ -136,31 +146,6 @@ def read_visits(folder: Path) -> tuple[str, list[Visit]]:
 def _stayed(name: str, here: dict[str, np.ndarray], elsewhere: Sequence[dict[str, np.ndarray]]) -> bool:
     """Whether an object stands in every other scan of the room where it stands in this one."""
     return all(name in there and np.abs(there[name] - here[name]).max() < 1e-6 for there in elsewhere)
-
-
-def _rows(method: str, groups: dict[str, list[tuple[str, list[Overlaps], float]]]) -> list[dict[str, object]]:
-    """A row for each kind of frames, and one for all."""
-    everything = {**groups, "all": [scene for scenes in groups.values() for scene in scenes]}
-    return [
-        {
-            "method": method,
-            "frames": frames,
-            "scenes": len(scenes),
-            "refused": sum(all(not len(s.scores) for s in scored) for _, scored, _ in scenes),
-            "seconds a scene": float(np.mean([seconds for *_, seconds in scenes])),
-            **segment_scores([s for _, scored, _ in scenes for s in scored]),
-        }
-        for frames, scenes in everything.items()
-    ]
-
-
-def _table(rows: Sequence[dict[str, object]]) -> Table:
-    table = Table(title="Instances without a network")
-    for name in rows[0]:
-        table.add_column(name)
-    for row in rows:
-        table.add_row(*(f"{v:.3g}" if isinstance(v, float) else str(v) for v in row.values()))
-    return table
 
 
 if __name__ == "__main__":

@@ -7,14 +7,13 @@ Peers have no mode for many rooms: theirs is one after the other. A row says not
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import Any
 
-import jax
 from rich.console import Console
 from rich.table import Table
 
@@ -22,10 +21,13 @@ from eval.data.flyingshape import open_flyingshape
 from eval.data.truth import KnownScene
 from eval.end_to_end import living_scene
 from eval.harness.batched import register_all
+from eval.harness.results import circumstances_now
+from eval.harness.run_folder import write_json
 from eval.peers.end_to_end import NAME, combined, without_learning
 from eval.peers.registration import Registrar, registrars
 from eval.performance.stopwatch import Job, Seconds, interleaved, timed
 from eval.registration import TruePair, ready_pairs, true_pairs
+from eval.scores.figures import Row
 from more2_jax.config import SceneConfig, preset
 from more2_jax.network.prior import Prior, load_prior
 from more2_jax.scene import run_scenes
@@ -52,30 +54,51 @@ def main(
         pairs: true matches to register, of the first rooms.
         scenes: rooms, of two scans each; the row of one room is of the first.
         repeats: rounds; every competitor once a round, after one that does not count.
-        out: a JSON file for the rows.
+        out: folder of results.json.
     """
     known, weights = first_rooms(data, scenes), load_prior(prior)
     upright = open_flyingshape(data).upright
     config = preset("robust", upright=upright)
     chosen = list(islice((p for s in known for p in true_pairs(s, "first")), pairs))
     tasks = {
-        f"registration of {len(chosen)} pairs": registration_jobs(weights, chosen, config),
-        "one room of two scans": room_jobs(weights, known[:1], config),
-        f"{len(known)} rooms of two scans": room_jobs(weights, known, config),
+        "registration of the pairs": registration_jobs(weights, chosen, config),
+        "one room": room_jobs(weights, known[:1], config),
+        "all rooms": room_jobs(weights, known, config),
     }
+    counts = dict(zip(tasks, (len(chosen), 1, len(known)), strict=True))
     jobs = {f"{task} / {who}": job for task, of_task in tasks.items() for who, job in of_task.items()}
-    found = interleaved(jobs, repeats)
-    rows = ratios({tuple(name.split(" / ")): taken for name, taken in found.items()})
-    Console().print(printed(rows))
-    said = {
-        "rooms": len(known),
-        "repeats": repeats,
-        "cores": cores(),
-        "device": jax.default_backend(),
-        "rows": rows,
-    }
+    taken = {tuple(name.split(" / ")): seconds for name, seconds in interleaved(jobs, repeats).items()}
+    Console().print(printed(ratios(taken), counts))
     if out is not None:
-        out.write_text(json.dumps(said, indent=1) + "\n")
+        out.mkdir(parents=True, exist_ok=True)
+        stated = {"program": "speed_tasks", "repeats": repeats, "cores": cores(), "prior": prior}
+        told = {**circumstances_now(), "settings": stated, "rows": rows_of(taken, counts, len(known))}
+        write_json(out / "results.json", told)
+
+
+def rows_of(
+    found: Mapping[tuple[str, ...], Seconds], counts: Mapping[str, int], rooms: int
+) -> list[dict[str, Any]]:
+    """Rows of results.json: wall and processor time of every task and competitor."""
+    return [
+        asdict(
+            Row(
+                name=task,
+                column=column,
+                method=who,
+                value=value,
+                unit="s",
+                better="lower",
+                count=counts[task],
+                failures=0,
+                ci95=None,
+                group="all",
+                scenes=rooms,
+            )
+        )
+        for (task, who), taken in found.items()
+        for column, value in (("wall", taken.wall), ("processor", taken.cpu))
+    ]
 
 
 def first_rooms(data: Path, count: int) -> list[KnownScene]:
@@ -121,12 +144,12 @@ def ratios(found: Mapping[tuple[str, ...], Seconds]) -> list[dict[str, Any]]:
     return rows
 
 
-def printed(rows: Sequence[Mapping[str, Any]]) -> Table:
-    """The rows as a table."""
+def printed(rows: Sequence[Mapping[str, Any]], counts: Mapping[str, int]) -> Table:
+    """The rows as a table, with how many pairs or rooms a task has."""
     table = Table("task", "who", "wall [s]", "processor [s]", "times ours, wall", "times ours, processor")
     for r in rows:
         numbers = (r["wall_s"], r["cpu_s"], r["wall_ratio"], r["cpu_ratio"])
-        table.add_row(r["task"], r["who"], *(f"{x:.2f}" for x in numbers))
+        table.add_row(f"{r['task']} ({counts[r['task']]})", r["who"], *(f"{x:.2f}" for x in numbers))
     return table
 
 

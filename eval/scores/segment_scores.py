@@ -6,16 +6,28 @@ lies on regions to ignore: neither right nor wrong.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Integer
-from scipy.linalg import block_diag
 
-from eval.scores.average_precision import average_precision
+from eval.scores.average_precision import ap_rows
+from eval.scores.figures import Figure, Record
 
 IOU = 0.5
+SEGMENT_FIGURES = (
+    *(
+        Figure(name=f"AP50, {name}", key=key, statistic="average_precision", unit="%", scale=100)
+        for name, key in (
+            ("moved", "moved"),
+            ("moved, labeled", "moved_labeled"),
+            ("all", "all"),
+            ("all, labeled", "all_labeled"),
+        )
+    ),
+    Figure(name="recall, moved", key="found_moved", statistic="mean", unit="%", scale=100),
+    Figure(name="recall, all", key="found", statistic="mean", unit="%", scale=100),
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,35 +61,22 @@ def overlaps(
     )
 
 
-def segment_scores(scans: Sequence[Overlaps]) -> dict[str, float]:
-    """AP and recall at IoU 0.5 over the instances of all scans together, of all objects and of those that moved.
+def segment_records(scan: Overlaps) -> list[Record]:
+    """What `SEGMENT_FIGURES` are made of: one record of all instances of a scan, and one for each object.
 
-    `… labeled`: without predictions that lie mostly on what the truth does not label, which may be things too. Scores
-    rank what is said to have moved; among all objects every prediction counts the same. NaN without such an object.
+    `labeled`: without predictions that lie mostly on what the truth does not label, which may be things too. Scores
+    rank what is said to have moved; among all objects every prediction counts the same.
     """
-    iou = np.asarray(block_diag(*(s.iou for s in scans)))
-    scores = np.concatenate([s.scores for s in scans])
-    moved = np.concatenate([s.moved for s in scans])
-    labeled = ~np.concatenate([s.unlabeled for s in scans])
-    on_static = iou[:, ~moved].max(axis=1, initial=0.0) >= IOU
+    iou, scores, labeled = scan.iou, scan.scores, ~scan.unlabeled
+    equal, of_moved = np.ones(len(scores)), iou[:, scan.moved]
+    counted = ~(iou[:, ~scan.moved].max(axis=1, initial=0.0) >= IOU)  # not on what stayed
+    both = counted & labeled
     found = iou.max(axis=0, initial=0.0) >= IOU
-    equal = np.ones(len(scores))
-    return {
-        "objects": float(len(moved)),
-        "objects moved": float(moved.sum()),
-        "instances": float(len(scores)),
-        "instances unlabeled": float((~labeled).sum()),
-        "AP50": average_precision(equal, iou, IOU),
-        "AP50 labeled": average_precision(equal[labeled], iou[labeled], IOU),
-        "AP50 moved": average_precision(scores[~on_static], iou[~on_static][:, moved], IOU),
-        "AP50 moved labeled": average_precision(
-            scores[~on_static & labeled], iou[~on_static & labeled][:, moved], IOU
-        ),
-        "AP50 moved, static wrong": average_precision(scores, iou[:, moved], IOU),
-        "recall": _mean(found),
-        "recall moved": _mean(found[moved]),
+    predicted = {
+        "all": ap_rows(equal, iou, (IOU,)),
+        "all_labeled": ap_rows(equal[labeled], iou[labeled], (IOU,)),
+        "moved": ap_rows(scores[counted], of_moved[counted], (IOU,)),
+        "moved_labeled": ap_rows(scores[both], of_moved[both], (IOU,)),
     }
-
-
-def _mean(of: Bool[np.ndarray, " n"]) -> float:
-    return float(of.mean()) if len(of) else float("nan")
+    objects = [{"found": bool(f)} for f in found]
+    return [predicted, *objects, *({"found_moved": bool(f)} for f in found[scan.moved])]
