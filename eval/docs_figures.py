@@ -57,6 +57,10 @@ FIGURES = {
     "registration of the pairs": ("registration of the pairs", "processor"),
     "one room": ("one room", "processor"),
     "all rooms": ("all rooms", "processor"),
+    "drawn in full": ("drawn in full", ""),
+    "a frame while the mouse drags": ("a frame while the mouse drags", ""),
+    "a frame while objects glide": ("a frame while objects glide", ""),
+    "file": ("file", ""),
     "time": ("time a scene", ""),
     "time a pair": ("time a pair", ""),
 }
@@ -141,11 +145,12 @@ def of_one(kept: dict[str, Any], shown: Sequence[str]) -> list[str]:
     for figure in shown:
         rows = rows_of(kept, figure)
         best = max(map(worth, rows.values()), default=0.0)
-        cells = [cell(r, worth(r) >= best) if (r := rows.get(m)) else "" for m in methods]
+        cells = [
+            cell(r, len(methods) > 1 and worth(r) >= best) if (r := rows.get(m)) else "" for m in methods
+        ]
         unit = next(iter(rows.values()))["unit"] if rows else ""
         lines.append(row_of([f"{figure} [{unit}]", *cells]))
-    date = kept["date"][:10]
-    return [*lines, "", f"`{kept['command']}`, {date}, {kept['rows'][0]['scenes']} rooms."]
+    return [*lines, "", f"`{kept['command']}`, {kept['date'][:10]}, {rooms_of(kept)}."]
 
 
 def of_methods(kept: dict[str, Any], shown: Sequence[str], only: str = "") -> list[str]:
@@ -161,9 +166,15 @@ def of_methods(kept: dict[str, Any], shown: Sequence[str], only: str = "") -> li
         found = [(rows.get(method), best[f]) for f, rows in tables.items()]
         cells = [cell(r, worth(r) >= most) if r else "" for r, most in found]
         lines.append(row_of([method, *cells]))
-    facts = [f"`{kept['command']}`", kept["date"][:10], f"{kept['rows'][0]['scenes']} rooms"]
+    facts = [f"`{kept['command']}`", kept["date"][:10], rooms_of(kept)]
     of = "objects" if OF_OBJECTS.search(kept["command"]) else "pairs"
     return [*lines, "", f"{', '.join(facts)}, {max(r['count'] for r in kept['rows'])} {of}."]
+
+
+def rooms_of(kept: dict[str, Any]) -> str:
+    """How many rooms a run has, in words."""
+    count = kept["rows"][0]["scenes"]
+    return f"{count} room" + "s" * (count > 1)
 
 
 def of_several(runs: dict[str, dict[str, Any]], shown: Sequence[str]) -> list[str]:

@@ -6,10 +6,9 @@ in software, which is the case measured.
 
 from __future__ import annotations
 
-import json
-import os
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +17,9 @@ import jax.numpy as jnp
 import numpy as np
 import trimesh
 from rich.console import Console
-from rich.table import Table
 
+from eval.harness.results import cost, write_rows
+from eval.harness.tables import on_screen
 from more2_jax.config import SceneConfig
 from more2_jax.network.prior import encode_ordered, load_prior, points_read
 from more2_jax.report import write_report
@@ -51,13 +51,10 @@ def main(
     out.mkdir(parents=True, exist_ok=True)
     page = out / "report.html"
     write_report(room(objects, points // objects, scans), page, SceneConfig())
-    results = {"objects": objects, "points": points, "page (MB)": page.stat().st_size / 1e6}
-    results |= measured(page, width, height)
-    (out / "results.json").write_text(json.dumps(results, indent=1))
-    table = Table("figure", "value")
-    for name, value in results.items():
-        table.add_row(name, f"{value:.2f}" if isinstance(value, float) else str(value))
-    Console().print(table)
+    file = cost("file", f"{objects} objects, {points:,} points", page.stat().st_size / 1e6, "MB")
+    rows = [file, *(replace(file, **figure) for figure in measured(page, width, height))]
+    write_rows(out, rows, program="page_speed", objects=objects, points=points, scans=scans)
+    Console().print(on_screen(rows, "The page"))
 
 
 def room(objects: int, points: int, scans: int) -> LivingScene:
@@ -118,8 +115,9 @@ def some_embedding() -> Embedding:
     return jax.tree.map(np.asarray, encode_ordered(prior, points, jnp.ones(count, bool)))
 
 
-def measured(path: Path, width: int, height: int) -> dict[str, Any]:
-    """First paint, ready, and milliseconds a frame: all of it at rest; while the mouse drags; while objects glide."""
+def measured(path: Path, width: int, height: int) -> list[dict[str, Any]]:
+    """First paint, drawn in full, and milliseconds a frame: all of it at rest; while the mouse drags; while objects
+    glide. Name, unit and value of each."""
     from playwright.sync_api import sync_playwright
 
     chromium = shutil.which("chromium") or shutil.which("google-chrome")
@@ -129,18 +127,16 @@ def measured(path: Path, width: int, height: int) -> dict[str, Any]:
         browser = driver.chromium.launch(executable_path=chromium, args=SOFTWARE_GL)
         loads = [load_times(browser, path, width, height) for _ in range(LOADS)]
         page = opened(browser, path, width, height)
-        result = {
-            "first paint (ms)": float(np.median([paint for paint, _ in loads])),
-            "ready (ms)": float(np.median([ready for _, ready in loads])),
-            "browser": browser.version,
-            "cores": os.cpu_count(),
-        }
         page.screenshot(path=str(path.with_suffix(".png")))
-        result |= pace("at rest, all of it", page, turn, lambda level: level == 0)
-        result |= pace("dragging", page, drag, lambda level: level > 0)
-        result |= pace("gliding", page, glide, lambda level: level > 0)
+        found = [
+            {"name": name, "unit": "s", "value": float(np.median(times)) / 1000}
+            for name, times in zip(("first paint", "drawn in full"), zip(*loads, strict=True), strict=True)
+        ]
+        found += pace("with all of it", page, turn, lambda level: level == 0)
+        found += pace("while the mouse drags", page, drag, lambda level: level > 0)
+        found += pace("while objects glide", page, glide, lambda level: level > 0)
         browser.close()
-    return result
+    return found
 
 
 def opened(browser: Any, path: Path, width: int, height: int) -> Any:
@@ -182,7 +178,9 @@ def glide(page: Any) -> None:
         page.wait_for_timeout(GLIDE_MS)
 
 
-def pace(name: str, page: Any, act: Callable[[Any], None], counts: Callable[[int], bool]) -> dict[str, float]:
+def pace(
+    name: str, page: Any, act: Callable[[Any], None], counts: Callable[[int], bool]
+) -> list[dict[str, Any]]:
     """Milliseconds of the frames drawn meanwhile, if their level of quality `counts`, under names of their own.
 
     The browser's processor time a frame does not depend on what else the machine does; it holds what the browser
@@ -195,12 +193,12 @@ def pace(name: str, page: Any, act: Callable[[Any], None], counts: Callable[[int
     used = processor_ms() - before
     frames = page.evaluate("window.more2.paceLog()")
     times = [took for _, took, level in frames if counts(level)]
-    return {
-        f"{name} (ms)": float(np.median(times)),
-        f"{name}, 95 % below (ms)": float(np.percentile(times, 95)),
-        f"{name}, processor (ms a frame)": used / len(frames),
-        f"{name}, frames": len(times),
+    found = {
+        f"a frame {name}": float(np.median(times)),
+        f"a frame {name}, 95 % below": float(np.percentile(times, 95)),
+        f"a frame {name}, processor": used / len(frames),
     }
+    return [{"name": k, "unit": "ms", "value": v, "count": len(times)} for k, v in found.items()]
 
 
 def processor_ms() -> float:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -18,8 +18,7 @@ import tyro
 from jaxtyping import Bool, Float, Integer
 from rich.console import Console
 
-from eval.harness.results import circumstances_now
-from eval.harness.run_folder import write_json
+from eval.harness.results import write_rows
 from eval.harness.tables import on_screen
 from eval.scores.figures import Figure, Record, rows_of
 from eval.scores.segment_scores import SEGMENT_FIGURES, overlaps, segment_records
@@ -86,10 +85,7 @@ def main(options: Annotated[Settings, tyro.conf.arg(name="")]) -> None:
         )
     records: dict[str, list[Record]] = {f.name: scored_scene(f) for f in folders}
     rows = rows_of(FIGURES, records, ("frames",))
-    options.out.mkdir(parents=True, exist_ok=True)
-    stated = {"program": "segmentation", "masks": "none", "scenes": len(folders)}
-    told = {**circumstances_now(), "settings": stated, "rows": [asdict(r) for r in rows]}
-    write_json(options.out / "results.json", told)
+    write_rows(options.out, rows, program="segmentation", masks="none", scenes=len(folders))
     Console().print(on_screen(rows, "Instances without a network"))
 
 

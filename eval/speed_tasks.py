@@ -8,7 +8,6 @@ Peers have no mode for many rooms: theirs is one after the other. A row says not
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
 from functools import partial
 from itertools import islice
 from pathlib import Path
@@ -21,8 +20,7 @@ from eval.data.flyingshape import open_flyingshape
 from eval.data.truth import KnownScene
 from eval.end_to_end import living_scene
 from eval.harness.batched import register_all
-from eval.harness.results import circumstances_now
-from eval.harness.run_folder import write_json
+from eval.harness.results import cost, write_rows
 from eval.peers.end_to_end import NAME, combined, without_learning
 from eval.peers.registration import Registrar, registrars
 from eval.performance.stopwatch import Job, Seconds, interleaved, timed
@@ -70,32 +68,14 @@ def main(
     taken = {tuple(name.split(" / ")): seconds for name, seconds in interleaved(jobs, repeats).items()}
     Console().print(printed(ratios(taken), counts))
     if out is not None:
-        out.mkdir(parents=True, exist_ok=True)
-        stated = {"program": "speed_tasks", "repeats": repeats, "cores": cores(), "prior": prior}
-        told = {**circumstances_now(), "settings": stated, "rows": rows_of(taken, counts, len(known))}
-        write_json(out / "results.json", told)
+        rows = rows_of(taken, counts, len(known))
+        write_rows(out, rows, program="speed_tasks", repeats=repeats, cores=cores(), prior=prior)
 
 
-def rows_of(
-    found: Mapping[tuple[str, ...], Seconds], counts: Mapping[str, int], rooms: int
-) -> list[dict[str, Any]]:
-    """Rows of results.json: wall and processor time of every task and competitor."""
+def rows_of(found: Mapping[tuple[str, ...], Seconds], counts: Mapping[str, int], rooms: int) -> list[Row]:
+    """Wall and processor time of every task and competitor."""
     return [
-        asdict(
-            Row(
-                name=task,
-                column=column,
-                method=who,
-                value=value,
-                unit="s",
-                better="lower",
-                count=counts[task],
-                failures=0,
-                ci95=None,
-                group="all",
-                scenes=rooms,
-            )
-        )
+        cost(task, who, value, "s", column, counts[task], rooms)
         for (task, who), taken in found.items()
         for column, value in (("wall", taken.wall), ("processor", taken.cpu))
     ]

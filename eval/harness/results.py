@@ -41,6 +41,32 @@ def finish(
     return rows
 
 
+def write_rows(out: Path, rows: Sequence[Row], **stated: Any) -> None:
+    """results.json of a program without a `RunFolder`: command, date, hardware, versions, settings as stated, rows."""
+    out.mkdir(parents=True, exist_ok=True)
+    told = {**circumstances_now(), "settings": stated, "rows": [dataclasses.asdict(r) for r in rows]}
+    write_json(out / "results.json", told)
+
+
+def cost(
+    name: str, method: str, value: float, unit: str, column: str = "", count: int = 1, scenes: int = 1
+) -> Row:
+    """A row of what something takes: time or memory, the less the better, without an interval."""
+    return Row(
+        name=name,
+        method=method,
+        value=value,
+        unit=unit,
+        column=column,
+        count=count,
+        scenes=scenes,
+        better="lower",
+        failures=0,
+        ci95=None,
+        group="all",
+    )
+
+
 def provenance(run: RunFolder, o: Options, circumstances: Mapping[str, Any]) -> dict[str, Any]:
     """Command, data, settings, hardware, versions: what a figure belongs to."""
     return {

@@ -77,6 +77,20 @@ def test_one_run_of_many_methods_has_a_line_a_method(docs):
     assert "| ours, robust | **80.0**" in ours and "GICP" not in ours
 
 
+def test_a_single_method_has_no_best_and_a_table_says_what_it_counts(docs):
+    results = RESULTS | {
+        "command": "python -m eval.segmentation --data rooms",
+        "rows": [row("AP50, moved", "", "changes", 60.0) | {"scenes": 1}],
+    }
+    (docs / "runs" / "a" / "results.json").write_text(json.dumps(results), encoding="utf-8")
+    main(docs / "runs" / "a", "a", docs)
+    mark = ONE.replace("MR, median RE", "AP50 moved")
+    one = with_tables(mark, docs / "figures")
+    assert "| AP50 moved [%] | 60.0 (59.0 to 61.0) |" in one and "2026-11-25, 1 room." in one
+    many = with_tables(mark.replace("moved", "moved; lines = methods"), docs / "figures")
+    assert "2026-11-25, 1 room, 8 objects." in many
+
+
 def test_ours_is_the_preset_of_the_run_whatever_its_variants_reach(docs):
     """The first method; the best of its variants would be chosen with the result in view."""
     better = row("MR", "strict", "ours, robust, otherwise", 99.0)

@@ -24,14 +24,14 @@ def test_every_task_is_compared_with_ours_in_the_same_task():
     }
     counts = {"a": 16, "b": 2}
     assert printed(ratios(found), counts).row_count == 4
-    kept = {(r["name"], r["method"], r["column"]): r for r in rows_of(found, counts, 2)}
-    assert {k: r["value"] for k, r in kept.items() if k[0] == "a"} == {
+    kept = {(r.name, r.method, r.column): r for r in rows_of(found, counts, 2)}
+    assert {k: r.value for k, r in kept.items() if k[0] == "a"} == {
         ("a", OURS, "wall"): 2,
         ("a", OURS, "processor"): 4,
         ("a", "peer", "wall"): 1,
         ("a", "peer", "processor"): 1,
     }
-    assert {(r["name"], r["count"], r["scenes"]) for r in kept.values()} == {("a", 16, 2), ("b", 2, 2)}
+    assert {(r.name, r.count, r.scenes) for r in kept.values()} == {("a", 16, 2), ("b", 2, 2)}
 
 
 def test_fewer_rooms_than_asked_for_are_an_error_that_says_both(tmp_path):
