@@ -63,6 +63,8 @@ FIGURES = {
     "file": ("file", ""),
     "time": ("time a scene", ""),
     "time a pair": ("time a pair", ""),
+    "processor time": ("processor time a scene", ""),
+    "processor time a pair": ("processor time a pair", ""),
 }
 SENSE = {"higher": 1.0, "lower": -1.0}
 OF_OBJECTS = re.compile(r"eval\.(?:reconstruction|segmentation)\b")  # programs that count objects, not pairs

@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import dataclasses
-import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,6 +25,7 @@ from eval.harness.runs import Run, Work, open_run
 from eval.peers.learned.methods import learned_registrars
 from eval.peers.learned.registry import stated
 from eval.peers.registration import Registrar, registrars
+from eval.performance.stopwatch import Clock, clock, told
 from eval.scores.figures import Figure, Record, in_columns
 from eval.scores.pose_scores import Pose, pose_scores
 from more2_jax.config import (
@@ -104,6 +104,7 @@ def figures(right_deg: float) -> list[Figure]:
     ]
     strict = dataclasses.replace(share, column="strict")
     distance = dataclasses.replace(median, name="MedCD", unit="m²")
+    time = Figure(name="time a pair", key="seconds", statistic="median", unit="s", better="lower")
     return [
         *in_columns(share),
         dataclasses.replace(strict, name="RE < 10°", key="re_deg.strict", limit=10),
@@ -112,7 +113,8 @@ def figures(right_deg: float) -> list[Figure]:
         dataclasses.replace(distance, key="cd_m2.paper", column="paper"),
         dataclasses.replace(distance, key="cd_m2.published", column="published"),
         dataclasses.replace(distance, key="cd_m.strict", column="strict", unit="cm", scale=100),
-        Figure(name="time a pair", key="seconds", statistic="median", unit="s", better="lower"),
+        time,
+        dataclasses.replace(time, name="processor time a pair", key="cpu_seconds"),
     ]
 
 
@@ -216,11 +218,11 @@ def own_records(
     found: list[tuple[str, Record]] = []
     motion: MotionModel = "upright" if upright else "free"
     for name, method in settings.items():
-        began = time.perf_counter()
+        began = clock()
         poses = register_all(prior, ready, method, motion, batch)
-        seconds = encoding_s + (time.perf_counter() - began) / len(pairs)
-        told = isinstance(method, SurfaceRegistration) and upright and method.search.free_weight > 0
-        seconds += looking_s if told else 0.0
+        seconds = encoding_s + (clock() - began) / len(pairs)
+        looks = isinstance(method, SurfaceRegistration) and upright and method.search.free_weight > 0
+        seconds = seconds + looking_s if looks else seconds
         found += [scored(p, T, name, seconds) for p, T in zip(pairs, poses, strict=True)]
         if closed_by and closed_by.pose_graph.steps and name == next(iter(settings)):
             found += closed_records(
@@ -237,16 +239,16 @@ def own_records(
 
 def ready_pairs(
     pairs: Sequence[TruePair], prior: Prior, batch: int
-) -> tuple[list[PairToRegister], float, float]:
+) -> tuple[list[PairToRegister], Clock, Clock]:
     """The pairs with their codes and sights, and the seconds that each of the two took a pair."""
     clouds = [c for p in pairs for c in p.clouds]
     normals = [i.normals for p in pairs for i in p.instances]
-    began = time.perf_counter()
+    began = clock()
     codes = embed_all(prior, clouds, batch, normals)
-    encoding_s = (time.perf_counter() - began) / len(pairs)
-    began = time.perf_counter()
+    encoding_s = (clock() - began) / len(pairs)
+    began = clock()
     sights = [p.sights() for p in pairs]
-    looking_s = (time.perf_counter() - began) / len(pairs)
+    looking_s = (clock() - began) / len(pairs)
     ready = [
         PairToRegister(
             source=ObservedObject(
@@ -268,13 +270,13 @@ def closed_records(
     poses: Sequence[Pose],
     scene: SceneConfig,
     method: str,
-    seconds: float,
+    seconds: Clock,
 ) -> list[tuple[str, Record]]:
     """Pairs registered in so many `seconds` each, as a scene has them in the end. `codes` are of the targets."""
-    began = time.perf_counter()
+    began = clock()
     scans = [(p.scene.scans[p.scan], p.scene.scans[0]) for p in pairs]
     closed = closed_poses(prior, [p.clouds for p in pairs], scans, codes, poses, scene)
-    seconds += (time.perf_counter() - began) / len(pairs)
+    seconds = seconds + (clock() - began) / len(pairs)
     return [scored(p, T, method, seconds) for p, T in zip(pairs, closed, strict=True)]
 
 
@@ -285,13 +287,13 @@ def peer_records(
     found: list[tuple[str, Record]] = []
     for name, register in peers.items():
         for p in pairs:
-            began = time.perf_counter()
+            began = clock()
             T = register(*p.clouds, upright)
-            found.append(scored(p, T, name, time.perf_counter() - began))
+            found.append(scored(p, T, name, clock() - began))
     return found
 
 
-def scored(p: TruePair, T: Pose | None, method: str, seconds: float) -> tuple[str, Record]:
+def scored(p: TruePair, T: Pose | None, method: str, seconds: Clock) -> tuple[str, Record]:
     """The record of one pair, with its scene's name."""
     scores = pose_scores(T, p.object, p.object, p.scan, 0, *p.clouds)
     return p.scene.name, {
@@ -299,7 +301,7 @@ def scored(p: TruePair, T: Pose | None, method: str, seconds: float) -> tuple[st
         "object": p.object.name,
         "category": p.object.category,
         "to_scan": p.scan,
-        "seconds": seconds,
+        **told(seconds),
         "pose": None if T is None else T.tolist(),
         **scores,
     }

@@ -9,6 +9,19 @@ from typing import Any
 
 import jax
 import numpy as np
+from jaxtyping import Float
+
+Clock = Float[np.ndarray, "2"]  # seconds of wall and of processor time; differences and shares of it, too
+
+
+def clock() -> Clock:
+    """Wall time, and the processor time of all threads so far."""
+    return np.array([time.perf_counter(), time.process_time()])
+
+
+def told(seconds: Clock) -> dict[str, float]:
+    """What a record says of it."""
+    return {"seconds": float(seconds[0]), "cpu_seconds": float(seconds[1])}
 
 
 @dataclass(frozen=True)
