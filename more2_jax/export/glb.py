@@ -42,19 +42,19 @@ def write_glb(scene: LivingScene, path: Path, scan: int) -> None:
     )
     channels: dict[str, Channels] = {}
     extras: dict[str, dict[str, Any]] = {}
-    for k, o in enumerate(scene.objects):
+    for o in scene.objects:
         node = track(o, scene.scans)
         for state, name, opacity in (("seen", o.id, 1.0), ("not_seen", f"{o.id}_not_seen", PALE)):
             if state in node.states:
-                shape = _shape(o, k, node, opacity)
+                shape = _shape(o, node, opacity)
                 graph.add_geometry(shape, node_name=name, geom_name=name, parent_node_name=ROOT)
                 channels[name] = _channels(node, T_middle_scan, state)
                 extras[name] = {"id": o.id, "label": o.label, "states": list(node.states)}
     path.write_bytes(export_glb(graph, buffer_postprocessor=_animator(channels, extras, scan)))
 
 
-def _shape(o: SceneObject, number: int, node: Track, opacity: float) -> trimesh.PointCloud | trimesh.Trimesh:
-    paint = [*rgb(number), round(255 * opacity)]
+def _shape(o: SceneObject, node: Track, opacity: float) -> trimesh.PointCloud | trimesh.Trimesh:
+    paint = [*rgb(o.number), round(255 * opacity)]
     if o.mesh is None:
         return trimesh.PointCloud(node.vertices, colors=np.tile(paint, (len(node.vertices), 1)))
     shape = trimesh.Trimesh(node.vertices, o.mesh.faces, process=False)

@@ -21,6 +21,6 @@ def write_ply(scene: LivingScene, path: Path, scan: int) -> None:
     there = placed(scene, scan)
     clouds = [apply_pose(T_scan_ref, accumulated_points(o)) for _, o, T_scan_ref in there]
     points, numbers = np.concatenate(clouds), np.repeat([k for k, _, _ in there], [len(c) for c in clouds])
-    states = {k: state_in(o, scene.scans[scan]) for k, o in enumerate(scene.objects)}
+    states = {o.number: state_in(o, scene.scans[scan]) for o in scene.objects}
     comments = [f"not seen: object {k}" for k, state in states.items() if state == "not_seen"]
     write_points(path, points, numbers, "object", comments=comments)

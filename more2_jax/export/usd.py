@@ -31,11 +31,11 @@ def write_usd(scene: LivingScene, path: Path, scan: int) -> None:
     stage.SetTimeCodesPerSecond(1)
     root = pxr.UsdGeom.Xform.Define(stage, "/scene")
     stage.SetDefaultPrim(root.GetPrim())
-    for k, o in enumerate(scene.objects):
+    for o in scene.objects:
         node = track(o, scene.scans)
         prim = _add_node(pxr, stage, o.id, node.poses("seen"), node.shown("seen"))
         _describe(pxr, prim, o, node)
-        _add_shape(pxr, stage, o, node.vertices, rgb(k))
+        _add_shape(pxr, stage, o, node.vertices, rgb(o.number))
         if (unseen := node.shown("not_seen")).any():
             _add_node(pxr, stage, f"{o.id}_not_seen", node.poses("not_seen"), unseen)
             _add_pale(pxr, stage, o)

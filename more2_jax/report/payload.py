@@ -63,7 +63,7 @@ def payload(scene: LivingScene, config: SceneConfig) -> tuple[dict[str, Any], st
     coarse = MAX_COARSE_FACES // len(scene.objects)
     return {
         "scans": [_scan(s, blob, points, middle) for s in scene.scans],
-        "objects": [_object(o, k, blob, points, faces, coarse, middle) for k, o in enumerate(scene.objects)],
+        "objects": [_object(o, blob, points, faces, coarse, middle) for o in scene.objects],
         "pairs": {f"{a}-{b}": _pair(scene, v, a, b) for (a, b), v in verdicts_of(scene, config).items()},
         "size": (high - low).tolist(),
         "box": {
@@ -102,7 +102,7 @@ def _background(s: ScanRecord) -> Float[np.ndarray, "b 3"]:
 
 
 def _object(
-    o: SceneObject, number: int, blob: Blob, points: float, faces: float, coarse: int, middle: Point
+    o: SceneObject, blob: Blob, points: float, faces: float, coarse: int, middle: Point
 ) -> dict[str, Any]:
     """One object; its cloud and mesh relative to `anchor`, the mean of its points in the reference frame."""
     anchor = o.points.mean(axis=0)
@@ -110,10 +110,10 @@ def _object(
     mesh = None if o.mesh is None else cluster_vertices(o.mesh, faces)
     return {
         "id": o.id,
-        "number": number,
-        "name": name_of(o, number),
-        "color": color(number),
-        "ink": ink(number),
+        "number": o.number,
+        "name": name_of(o),
+        "color": color(o.number),
+        "ink": ink(o.number),
         "coverage": None if o.mesh is None else coverage(o.mesh, o.points),
         "observations": [_observation(o, seen, anchor, middle) for seen in o.observations],
         "cloud": blob.add_points(np.concatenate(parts) - anchor),
@@ -151,6 +151,6 @@ def _observation(o: SceneObject, seen: Observation, anchor: Point, middle: Point
     }
 
 
-def name_of(o: SceneObject, number: int) -> str:
+def name_of(o: SceneObject) -> str:
     """What a person calls it: its label, else `object 3`."""
-    return o.label or f"object {number}"
+    return o.label or f"object {o.number}"

@@ -106,6 +106,14 @@ def test_ply_places_all_points_in_the_scan(tmp_path, scan):
         np.testing.assert_allclose(points[vertices["object"] == k], placed(o, o.points, s), atol=1e-8)
 
 
+def test_an_object_keeps_its_number_where_others_are_gone(tmp_path):
+    """Joined parts leave gaps among the ids."""
+    fewer = dataclasses.replace(SCENE, objects=SCENE.objects[1:], changes=())
+    vertices = PlyData.read(str(export_scene(fewer, tmp_path, "ply", scan=0)))["vertex"]
+    ids = [o.id for o in fewer.objects if seen_in(o, 0)]
+    assert [f"object_{n:03d}" for n in np.unique(vertices["object"])] == ids
+
+
 POSE = {
     "type": "array",
     "items": {"type": "array", "items": {"type": "number"}, "minItems": 4, "maxItems": 4},

@@ -313,6 +313,16 @@ def test_fifty_colors_differ():
     assert len({color(k) for k in range(50)}) == 50
 
 
+def test_the_page_calls_an_object_by_the_number_of_its_id():
+    """Joined parts leave gaps among the ids."""
+    fewer = dataclasses.replace(SCENE, objects=SCENE.objects[2:], changes=())
+    told = payload(fewer, CONFIG)[0]["objects"]
+    assert [(o["id"], o["number"], o["color"]) for o in told] == [
+        (f"object_{n:03d}", n, color(n)) for n in (2, 3, 4)
+    ]
+    assert told[0]["name"] == "object 2"
+
+
 @pytest.mark.parametrize("number", range(50))
 def test_numbers_are_readable_on_their_color(number):
     luminance = float(linear(np.array(rgb(number)) / 255) @ [0.2126, 0.7152, 0.0722])
