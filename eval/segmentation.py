@@ -86,7 +86,7 @@ def main(options: Annotated[Settings, tyro.conf.arg(name="")]) -> None:
     records: dict[str, list[Record]] = {f.name: scored_scene(f) for f in folders}
     rows = rows_of(FIGURES, records, ("frames",))
     write_rows(options.out, rows, program="segmentation", masks="none", scenes=len(folders))
-    Console().print(on_screen(rows, "Instances without a network"))
+    Console().print(on_screen([r for r in rows if r.group == "all"], "Instances without a network"))
 
 
 def scored_scene(folder: Path) -> list[Record]:
