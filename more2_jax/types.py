@@ -333,11 +333,6 @@ class SceneObject:
     mesh: Mesh | None = None
     color: Color | None = None  # of the accumulated observations whose scans have colors
 
-    @property
-    def number(self) -> int:
-        """That of its id: 3 of `object_003`. It is no place in `LivingScene.objects`: joined parts leave gaps."""
-        return int(self.id.rpartition("_")[2])
-
 
 @dataclass(frozen=True, kw_only=True)
 class Changes:

@@ -15,6 +15,7 @@ from trimesh.visual.material import PBRMaterial
 
 from more2_jax.export.placing import PALE, State, Track, placed, quaternions, track
 from more2_jax.report import rgb
+from more2_jax.tracking.objects import number_of
 from more2_jax.types import LivingScene, SceneObject
 
 ROOT = "living_scene"  # the node that holds all objects and turns z up into glTF's y up
@@ -54,7 +55,7 @@ def write_glb(scene: LivingScene, path: Path, scan: int) -> None:
 
 
 def _shape(o: SceneObject, node: Track, opacity: float) -> trimesh.PointCloud | trimesh.Trimesh:
-    paint = [*rgb(o.number), round(255 * opacity)]
+    paint = [*rgb(number_of(o)), round(255 * opacity)]
     if o.mesh is None:
         return trimesh.PointCloud(node.vertices, colors=np.tile(paint, (len(node.vertices), 1)))
     shape = trimesh.Trimesh(node.vertices, o.mesh.faces, process=False)

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
-from more2_jax.tracking.objects import accumulated_points, observation_in, place_of
+from more2_jax.tracking.objects import accumulated_points, number_of, observation_in, place_of
 from more2_jax.types import LivingScene, ScanRecord, SceneObject
 
 State = Literal["seen", "not_seen", "absent"]  # of an object in a scan
@@ -26,7 +26,7 @@ def pose_in(o: SceneObject, scan: int) -> Float[np.ndarray, "4 4"] | None:
 
 def placed(scene: LivingScene, scan: int) -> list[tuple[int, SceneObject, Float[np.ndarray, "4 4"]]]:
     """Number, object and T_scan_ref of all objects in a scan. Raises ValueError if there is none."""
-    poses = [(o.number, o, pose_in(o, scan)) for o in scene.objects]
+    poses = [(number_of(o), o, pose_in(o, scan)) for o in scene.objects]
     there = [(k, o, T) for k, o, T in poses if T is not None]
     if not there:
         raise ValueError(f"scan {scan} ({scene.scans[scan].name}) shows no object; needed another scan")

@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float
 
 from more2_jax.export.placing import PALE, Track, quaternions, track
 from more2_jax.report import rgb
+from more2_jax.tracking.objects import number_of
 from more2_jax.types import LivingScene, SceneObject
 
 POINT_WIDTH_M = 0.01
@@ -35,7 +36,7 @@ def write_usd(scene: LivingScene, path: Path, scan: int) -> None:
         node = track(o, scene.scans)
         prim = _add_node(pxr, stage, o.id, node.poses("seen"), node.shown("seen"))
         _describe(pxr, prim, o, node)
-        _add_shape(pxr, stage, o, node.vertices, rgb(o.number))
+        _add_shape(pxr, stage, o, node.vertices, rgb(number_of(o)))
         if (unseen := node.shown("not_seen")).any():
             _add_node(pxr, stage, f"{o.id}_not_seen", node.poses("not_seen"), unseen)
             _add_pale(pxr, stage, o)

@@ -24,7 +24,7 @@ from more2_jax.report.thinning import (
     random_subsample,
 )
 from more2_jax.report.wording import Verdict, changes_from, doubts_of, headline, phrase, verdict
-from more2_jax.tracking.objects import place_of
+from more2_jax.tracking.objects import number_of, place_of
 from more2_jax.types import LivingScene, Mesh, Observation, ScanRecord, SceneObject
 
 Point = Float[np.ndarray, "3"]
@@ -110,10 +110,10 @@ def _object(
     mesh = None if o.mesh is None else cluster_vertices(o.mesh, faces)
     return {
         "id": o.id,
-        "number": o.number,
+        "number": number_of(o),
         "name": name_of(o),
-        "color": color(o.number),
-        "ink": ink(o.number),
+        "color": color(number_of(o)),
+        "ink": ink(number_of(o)),
         "coverage": None if o.mesh is None else coverage(o.mesh, o.points),
         "observations": [_observation(o, seen, anchor, middle) for seen in o.observations],
         "cloud": blob.add_points(np.concatenate(parts) - anchor),
@@ -153,4 +153,4 @@ def _observation(o: SceneObject, seen: Observation, anchor: Point, middle: Point
 
 def name_of(o: SceneObject) -> str:
     """What a person calls it: its label, else `object 3`."""
-    return o.label or f"object {o.number}"
+    return o.label or f"object {number_of(o)}"

@@ -111,6 +111,11 @@ def reference_pose(o: SceneObject) -> Pose:
     return np.eye(4) if seen is None else seen.T_ref_scan
 
 
+def number_of(o: SceneObject) -> int:
+    """That of its id: 3 of `object_003`. It is no place in `LivingScene.objects`: joined parts leave gaps."""
+    return int(o.id.rpartition("_")[2])
+
+
 def observation_in(o: SceneObject, scan: int) -> Observation | None:
     """The object's observation in a scan, if it was there."""
     return next((seen for seen in o.observations if seen.scan == scan), None)
