@@ -181,18 +181,30 @@ def rooms_of(kept: dict[str, Any]) -> str:
 
 def of_several(runs: dict[str, dict[str, Any]], shown: Sequence[str]) -> list[str]:
     """A line a run, a column a figure: ours / the best of the others."""
-    lines = [
-        row_of(["run", *shown, "rooms, pairs" if "recall" in shown else "rooms, objects", "date"]),
-        row_of(["---"] * (len(shown) + 3)),
-    ]
+    dates = list(dict.fromkeys(kept["date"][:10] for kept in runs.values()))
+    counted_in = "rooms, pairs" if "recall" in shown else "rooms, objects"
+    head = ["run", *shown, counted_in, *["date"] * (len(dates) > 1)]
+    lines = [row_of(head), row_of(["---"] * len(head))]
     for name, kept in runs.items():
         cells = [against_best(rows_of(kept, figure)) for figure in shown]
         counted = rows_of(kept, "recall") or rows_of(kept, shown[0])
         pairs = max((r["count"] for r in counted.values()), default=0)
         scenes = kept["rows"][0]["scenes"]
-        lines.append(row_of([f"`{name}`", *cells, f"{scenes}, {pairs}", kept["date"][:10]]))
-    commands = dict.fromkeys(general(name, kept["command"]) for name, kept in runs.items())
-    return [*lines, "", f"{', '.join(f'`{c}`' for c in commands)}."]
+        date = [kept["date"][:10]] * (len(dates) > 1)
+        lines.append(row_of([f"`{name}`", *cells, f"{scenes}, {pairs}", *date]))
+    told = commands_of([general(name, kept["command"]) for name, kept in runs.items()])
+    return [*lines, "", ", ".join([told, *dates] if len(dates) == 1 else [told]) + "."]
+
+
+def commands_of(commands: Sequence[str]) -> str:
+    """Commands that differ in options alone as one, with the options that only some have beside it."""
+    parts = [re.split(r" (?=--)", c) for c in commands]
+    programs, options = {p[0] for p in parts}, list(dict.fromkeys(o for p in parts for o in p[1:]))
+    if len(programs) > 1:
+        return ", ".join(f"`{c}`" for c in dict.fromkeys(commands))
+    common = [o for o in options if all(o in p for p in parts)]
+    some = [f"`{o}`" for o in options if o not in common]
+    return f"`{' '.join([*programs, *common])}`" + (f", some with {', '.join(some)}" if some else "")
 
 
 def general(name: str, command: str) -> str:

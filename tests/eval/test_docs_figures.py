@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from eval.docs_chart import CHART, REGISTRATION_CHART, RUNS, bars_of, draw, plain, shares_of, shown_in
-from eval.docs_figures import BLOCK, FIGURES, general, kept_of, main, with_tables
+from eval.docs_figures import BLOCK, FIGURES, commands_of, general, kept_of, main, with_tables
 
 DOCS = Path(__file__).parents[2] / "docs"
 
@@ -102,9 +102,26 @@ def test_ours_is_the_preset_of_the_run_whatever_its_variants_reach(docs):
 
 def test_several_runs_show_ours_beside_the_best_peer(docs):
     made = with_tables(TWO, docs / "figures")
-    assert made.count("| **80.0** / 75.0 | 2.00 / **1.00** | 2, 8 | 2026-11-25 |") == 2
+    assert made.count("| **80.0** / 75.0 | 2.00 / **1.00** | 2, 8 |\n") == 2
+    assert made.count("2026-11-25") == 1  # of both
     assert made.count(f"`{RESULTS['command']}") == 1  # rooms of both have no name of their own
     assert with_tables(made, docs / "figures") == made
+
+
+def test_runs_of_different_days_say_so(docs):
+    results = RESULTS | {"date": "2026-11-26T01:00:00+00:00"}
+    (docs / "runs" / "b" / "results.json").write_text(json.dumps(results), encoding="utf-8")
+    main(docs / "runs" / "b", "b", docs)
+    made = with_tables(TWO, docs / "figures")
+    assert made.count("| 2, 8 | 2026-11-25 |") == made.count("| 2, 8 | 2026-11-26 |") == 1
+    assert made.count("| date |") == 1
+
+
+def test_options_that_some_runs_have_stand_beside_the_command():
+    some = ["python -m p --data D --masks M", "python -m p --data D", "python -m p --data D --upright no"]
+    assert commands_of(some) == "`python -m p --data D`, some with `--masks M`, `--upright no`"
+    assert commands_of(some[1:2] * 2) == "`python -m p --data D`"
+    assert commands_of([some[1], "python -m q --data D"]) == "`python -m p --data D`, `python -m q --data D`"
 
 
 def test_commands_that_differ_in_names_alone_are_one():
