@@ -12,6 +12,7 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
+from compiling import LITTLE
 from places import ROOT
 from sphere_shards import sphere_shards
 
@@ -98,13 +99,15 @@ def made(tmp_path_factory) -> Path:
     return folder
 
 
-def started(folder: Path, out: str, *more: str, devices: int = 1) -> subprocess.Popen:
+def started(folder: Path, out: str, *more: str, devices: int = 1, quickly: bool = False) -> subprocess.Popen:
     files = ["--config", str(folder / "settings.yaml"), "--shards", str(folder), "--out", str(folder / out)]
-    return program(["-m", "train.prior", *files, *more], devices)
+    return program(["-m", "train.prior", *files, *more], devices, quickly)
 
 
-def program(arguments: list[str], devices: int = 1) -> subprocess.Popen:
+def program(arguments: list[str], devices: int = 1, quickly: bool = False) -> subprocess.Popen:
+    """A process with so many devices; `quickly`: that compiles as tests do, not as for users."""
     environment = os.environ | {
+        LITTLE.upper(): str(quickly),
         "JAX_PLATFORMS": "cpu",
         "XLA_FLAGS": f"--xla_force_host_platform_device_count={devices}",
         "PYTHONPATH": str(ROOT),
@@ -143,14 +146,14 @@ def test_in_short_a_run_on_two_devices_is_that_on_one_and_resumes_bit_for_bit(tm
     """What the slow tests below try at length."""
     (tmp_path / "settings.yaml").write_text(FEW)
     sphere_shards(tmp_path)
-    killed = program(["-c", LET_BE_THEN_KILLED_AT_A_CHECKPOINT, str(tmp_path)], devices=2)
+    killed = program(["-c", LET_BE_THEN_KILLED_AT_A_CHECKPOINT, str(tmp_path)], 2, quickly=True)
     _, err = killed.communicate(timeout=60 * MINUTES)
     assert killed.returncode == -signal.SIGKILL, err[-2000:]
     assert (tmp_path / "killed" / "checkpoints" / "2").exists() and len(logs(tmp_path, "killed")[0]) == 1
-    finish(started(tmp_path, "killed", devices=2))
+    finish(started(tmp_path, "killed", devices=2, quickly=True))
     for name in ("weights.npz", "best.npz"):
         np.testing.assert_array_equal(*(weights(tmp_path / k / name) for k in ("let_be", "killed")))
-    finish(started(tmp_path, "one"))
+    finish(started(tmp_path, "one", quickly=True))
     for a, b, one in zip(*logs(tmp_path, "let_be", "killed", "one"), strict=True):
         assert (a["step"], a["train"], a["val"]) == (b["step"], b["train"], b["val"])
         assert a["step"] == one["step"] and a["train"] == pytest.approx(one["train"], rel=1e-3)
