@@ -200,7 +200,9 @@ def dominant_eigenvector(matrix: Float[Array, "d d"]) -> Float[Array, " d"]:
     Where the largest eigenvalue is repeated, some unit vector of its space; of a zero matrix, (1, 0, …).
     """
     size = jnp.sqrt(jnp.sum(matrix * matrix) + TINY)
-    power = matrix / size + jnp.eye(len(matrix), dtype=matrix.dtype)  # eigenvalues in [0, 2]: the largest dominates
+    power = matrix / size + jnp.eye(
+        len(matrix), dtype=matrix.dtype
+    )  # eigenvalues in [0, 2]: the largest dominates
     for _ in range(20):
         power = jnp.matmul(power, power, precision="highest")
         power = power / jnp.trace(power)

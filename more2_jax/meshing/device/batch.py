@@ -42,7 +42,7 @@ def padded_object(
     if normals is not None:
         sides[:count] = normals
     known = np.array(sensors is not None or normals is not None)
-    return PaddedObject(
+    return PaddedObject(  # type: ignore[arg-type]
         embedding=dataclasses.replace(embedding, origin=None),
         points=placed,
         mask=np.arange(size) < count,

@@ -13,12 +13,12 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from jaxtyping import Int
 
-CORNERS = tuple(itertools.product((0, 1), repeat=3))  # of a cell; corner 4 x + 2 y + z
-# Of a cell: the axis each runs along, and the corner it begins at.
-EDGES = tuple((axis, corner) for axis in range(3) for corner in CORNERS if not corner[axis])
-
 Corner = tuple[int, ...]
 Triangle = tuple[int, int, int]  # of edges, counterclockwise as seen from outside the body
+
+CORNERS: tuple[Corner, ...] = tuple(itertools.product((0, 1), repeat=3))  # of a cell; corner 4 x + 2 y + z
+# Of a cell: the axis each runs along, and the corner it begins at.
+EDGES = tuple((axis, corner) for axis in range(3) for corner in CORNERS if not corner[axis])
 
 
 def edge_between(a: Corner, b: Corner) -> int:
@@ -95,7 +95,5 @@ def triangle_table() -> Int[np.ndarray, "256 t 3"]:
     return table
 
 
-FACE_EDGES = tuple(
-    {edge_between(face[i], face[(i + 1) % 4]) for i in range(4)} for face in cell_faces()
-)
+FACE_EDGES = tuple({edge_between(face[i], face[(i + 1) % 4]) for i in range(4)} for face in cell_faces())
 TRIANGLES = triangle_table()

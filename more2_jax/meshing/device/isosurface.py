@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int
 
 from more2_jax.meshing.device.cube_table import CORNERS, EDGES, TRIANGLES
 from more2_jax.meshing.device.rows import at_rows, true_places
-from more2_jax.types import pytree, quantity
+from more2_jax.types import AnyArray, pytree, quantity
 
 Grid = Float[Array, "n n n"]
 
@@ -18,10 +18,10 @@ Grid = Float[Array, "n n n"]
 class IsoSurface:
     """Triangles of one surface. All there is, if neither count is more than there are rows."""
 
-    vertices: Float[Array, "r 3"] = quantity("position")  # in steps from the grid's first corner
-    triangles: Int[Array, "r t 3"] = quantity("invariant")  # of each crossed cell, outward; −1 fills up
-    vertex_count: Int[Array, ""] = quantity("invariant")
-    cell_count: Int[Array, ""] = quantity("invariant")  # of the cells that the surface crosses
+    vertices: Float[AnyArray, "*b r 3"] = quantity("position")  # in steps from the grid's first corner
+    triangles: Int[AnyArray, "*b r t 3"] = quantity("invariant")  # of each crossed cell, outward; −1 fills up
+    vertex_count: Int[AnyArray, "*b"] = quantity("invariant")
+    cell_count: Int[AnyArray, "*b"] = quantity("invariant")  # of the cells that the surface crosses
 
 
 def iso_surface(values: Grid, step: Float[Array, ""], rows: int) -> IsoSurface:
@@ -57,12 +57,15 @@ def cell_triangles(
     """Triangles of the crossed cells, and how many cells these are; `number`: of every edge's vertex."""
     shape = np.array(inside.shape)
     i, j, k = shape - 1
-    case = sum(
+    bits = [
         inside[x : x + i, y : y + j, z : z + k].astype(jnp.int32) << bit
         for bit, (x, y, z) in enumerate(CORNERS)
-    ).ravel()
+    ]
+    case = jnp.stack(bits).sum(axis=0).ravel()
     cells, counts = true_places((case > 0) & (case < 255), rows)
-    node = jnp.stack(jnp.unravel_index(cells, (i, j, k)), axis=1) @ np.array([shape[1] * shape[2], shape[2], 1])
+    node = jnp.stack(jnp.unravel_index(cells, (i, j, k)), axis=1) @ np.array(
+        [shape[1] * shape[2], shape[2], 1]
+    )
     offset = [axis * shape.prod() + np.ravel_multi_index(corner, shape) for axis, corner in EDGES]
     of_edges = at_rows(number, node[:, None] + np.array(offset))
     of_case = jnp.asarray(TRIANGLES)[at_rows(case, cells)]

@@ -94,7 +94,7 @@ def own_points(
 def spread(
     points: Float[Array, "n 3"], found: Numbers, other: Numbers, cells: int, half_width: Float[Array, ""]
 ) -> Numbers:
-    """The nearest of two points and of those that neighbors know; what comes from the far side is only another point."""
+    """The nearest of two points and of what neighbors know; from the far side of the cube comes just another point."""
     axis = axis_places(cells, half_width)
 
     def squared(index: Numbers) -> Grid:

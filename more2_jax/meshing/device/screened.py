@@ -33,7 +33,8 @@ def screened_poisson(
     `margin`: empty space around, for the transform takes the box as periodic.
     """
     cells = len(field) - 1
-    size = next_fast_len(cells + 1 + int(np.ceil(margin * cells / (2 * HALF_WIDTH))), real=True)
+    space = cells + 1 + int(np.ceil(margin * cells / (2 * HALF_WIDTH)))
+    size = next_fast_len(space, real=True) or space
     own = 2 * half_width / cells
     x, y, z = wavenumbers(size, own)
     squared = x**2 + y**2 + z**2
@@ -41,18 +42,19 @@ def screened_poisson(
     width = jnp.maximum(step, jnp.sqrt(jnp.maximum(masked_median(area, mask), 1e-12)))
     flux = splat(points, mask, -area[:, None] * normals, cells, half_width)
     along = [jnp.fft.rfftn(f, s=(size,) * 3) * k for f, k in zip(flux, (x, y, z), strict=True)]
-    divergence = 1j * sum(along) * jnp.exp(-0.5 * width**2 * squared)
+    # Points that share corners of cells as large as `step` are spread by so much more.
+    variance = width**2 + (step**2 - own**2) / 6
+    divergence = 1j * sum(along) * jnp.exp(-0.5 * variance * squared)
     smooth = jnp.fft.rfftn(prior, s=(size,) * 3) * squared * jnp.exp(-0.5 * step**2 * squared)
     change = jnp.fft.irfftn((smooth + divergence) / (squared + length**-2.0), s=(size,) * 3)
     change = change[: cells + 1, : cells + 1, : cells + 1]
     return (0.5 - prior + change) * 2 * TRANSITION_CELLS * step
 
 
-def wavenumbers(size: int, step: Float[Array, ""]) -> tuple[Array, Array, Array]:
+def wavenumbers(size: int, step: Float[Array, ""]) -> list[Array]:
     """Along each axis of a real transform's result, to be broadcast."""
-    full, half = np.fft.fftfreq(size), np.fft.rfftfreq(size)
-    x, y, z = (2 * np.pi * k.astype(np.float32) / step for k in (full, full, half))
-    return x[:, None, None], y[:, None], z
+    full, half = jnp.fft.fftfreq(size), jnp.fft.rfftfreq(size)
+    return [2 * jnp.pi * k / step for k in (full[:, None, None], full[:, None], half)]
 
 
 def splat(

@@ -31,7 +31,7 @@ from more2_jax.meshing.normal_orientation import (
     TOLERANCE,
     VOTE_WEIGHT,
 )
-from more2_jax.types import pytree, quantity
+from more2_jax.types import AnyArray, pytree, quantity
 
 RAYS_AT_ONCE = 128
 
@@ -55,9 +55,9 @@ class Cloud:
 class Views:
     """What a scan says of sides: sensors that saw a point (NaN fills up), normals (zeros where not known)."""
 
-    sensors: Float[Array, "n s 3"] = quantity("position")
-    normals: Points = quantity("direction")
-    known: Bool[Array, ""] = quantity("invariant")  # whether it says either
+    sensors: Float[AnyArray, "*b n s 3"] = quantity("position")
+    normals: Float[AnyArray, "*b n 3"] = quantity("direction")
+    known: Bool[AnyArray, "*b"] = quantity("invariant")  # whether it says either
 
 
 def outward_signs(cloud: Cloud, normal: Points, slope: Values, views: Views) -> Values:
@@ -75,7 +75,9 @@ def outward_signs(cloud: Cloud, normal: Points, slope: Values, views: Views) -> 
     ratio = jnp.where(jnp.abs(by_view) < 1, jnp.clip(jnp.log(free[0] / free[1]), -1, 1), 0.0)
     weight = jnp.where(views.known, GEOMETRY_WEIGHT, 1.0)
     heard = jnp.where(voter < count, row, len(normal))
-    vote = (weight * FIELD_WEIGHT * jnp.clip(slope, -1, 1)).at[heard].add(weight * ratio + by_view, mode="drop")
+    vote = (
+        (weight * FIELD_WEIGHT * jnp.clip(slope, -1, 1)).at[heard].add(weight * ratio + by_view, mode="drop")
+    )
     return jnp.where(agreed(cloud, normal, jnp.where(cloud.mask, vote, 0.0)) < 0, -1.0, 1.0)
 
 

@@ -31,7 +31,7 @@ from more2_jax.meshing.observed_surface import (
 )
 from more2_jax.network.decoder import ObjectField
 from more2_jax.network.prior import Prior, field_sdf, object_field
-from more2_jax.types import Embedding, pytree, quantity
+from more2_jax.types import AnyArray, Embedding, pytree, quantity
 
 Grid = Float[Array, "i j k"]
 Points = Float[Array, "n 3"]
@@ -43,12 +43,12 @@ class PaddedObject:
     """One object as the device takes it; canonical units, relative to the center of its code."""
 
     embedding: Embedding = quantity("record")  # without its origin
-    points: Points = quantity("position")
-    mask: Bool[Array, " n"] = quantity("invariant")
+    points: Float[AnyArray, "*b n 3"] = quantity("position")
+    mask: Bool[AnyArray, "*b n"] = quantity("invariant")
     views: Views = quantity("record")
-    half_width: Float[Array, ""] = quantity("length")  # of the query box
-    lowest: Float[Array, ""] = quantity("length")  # nothing lies below; −∞ where there is no floor
-    several: Bool[Array, ""] = quantity("invariant")  # whether several scans saw it
+    half_width: Float[AnyArray, "*b"] = quantity("length")  # of the query box
+    lowest: Float[AnyArray, "*b"] = quantity("length")  # nothing lies below; −∞ where there is no floor
+    several: Bool[AnyArray, "*b"] = quantity("invariant")  # whether several scans saw it
 
 
 @full_precision
@@ -91,9 +91,7 @@ def without_outliers(o: PaddedObject, config: MeshingConfig) -> PaddedObject:
     else:
         mask = o.mask
     order = real_first(mask)
-    rows = jax.tree.map(
-        lambda x: at_rows(x, order), (o.points, mask, o.views.sensors, o.views.normals)
-    )
+    rows = jax.tree.map(lambda x: at_rows(x, order), (o.points, mask, o.views.sensors, o.views.normals))
     points = jnp.where(rows[1][:, None], rows[0], 0.0)
     views = dataclasses.replace(o.views, sensors=rows[2], normals=rows[3])
     return dataclasses.replace(o, points=points, mask=rows[1], views=views)
@@ -168,5 +166,13 @@ def screened(field: Grid, planes: OrientedPlanes, o: PaddedObject, config: Meshi
     area = surface_areas(planes.points, planes.normal, planes.distance, planes.neighbors)
     step = jnp.where(resolved, finest, o.half_width / asked_cells(config))
     return screened_poisson(
-        field, planes.points, planes.mask, planes.normal, area, o.half_width, step, length, config.screening_length
+        field,
+        planes.points,
+        planes.mask,
+        planes.normal,
+        area,
+        o.half_width,
+        step,
+        length,
+        config.screening_length,
     )
