@@ -58,7 +58,7 @@ def device_meshes(
         rows = [as_row(o, config) for o in some]
         found = surfaces(prior, rows, config.meshing, at_once)
         for n, (o, row) in enumerate(zip(some, rows, strict=True)):
-            surface = jax.tree.map(lambda x, n=n: x[n], found)
+            surface = jax.tree.map(lambda x, n=n: np.asarray(x[n]), found)
             if overflows(surface):
                 yield object_mesh(prior, o, config)
             else:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from functools import partial
+from typing import Any
 
 import jax
 import numpy as np
@@ -19,7 +20,7 @@ from more2_jax.network.prior import Prior
 from more2_jax.network.row_map import chunked
 from more2_jax.types import Embedding, Mesh
 
-SIZES = 4096, 16384  # that clouds are padded to
+SIZES = 1024, 4096, 16384  # that clouds are padded to
 ROOM = 8  # crossed cells there is room for, over the cells of a side of the grid: a few times a cube's faces
 
 
@@ -42,15 +43,15 @@ def padded_object(
     if normals is not None:
         sides[:count] = normals
     known = np.array(sensors is not None or normals is not None)
-    return PaddedObject(  # type: ignore[arg-type]
-        embedding=dataclasses.replace(embedding, origin=None),
-        points=placed,
-        mask=np.arange(size) < count,
-        views=Views(sensors=eyes, normals=sides, known=known),
-        half_width=np.float32(half_width),
-        lowest=np.float32(lowest_height(embedding, floor)),
-        several=np.array(several),
-    )
+    arrays: dict[str, Any] = {
+        "points": placed,
+        "mask": np.arange(size) < count,
+        "views": Views(**{"sensors": eyes, "normals": sides, "known": known}),
+        "half_width": np.array(half_width, np.float32),
+        "lowest": np.array(lowest_height(embedding, floor), np.float32),
+        "several": np.array(several),
+    }
+    return PaddedObject(embedding=dataclasses.replace(embedding, origin=None), **arrays)
 
 
 def surfaces(prior: Prior, objects: list[PaddedObject], config: MeshingConfig, at_once: int) -> IsoSurface:

@@ -109,7 +109,7 @@ def spread(
         distance = squared(index)
         return jnp.minimum(best[0], distance), jnp.where(distance < best[0], index, best[1])
 
-    def heard(_: int, best: tuple[Grid, Numbers]) -> tuple[Grid, Numbers]:
+    def heard(_: Array, best: tuple[Grid, Numbers]) -> tuple[Grid, Numbers]:
         for axis, way in itertools.product(range(3), (1, -1)):
             best = nearer(best, jnp.roll(best[1], way, axis=axis))
         return best

@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float, Int
 from more2_jax.config import MeshingConfig
 from more2_jax.geometry.full_precision import full_precision
 from more2_jax.geometry.points import nearest_index
+from more2_jax.meshing.device.box import in_box
 from more2_jax.meshing.device.correction import OrientedPlanes, corrected
 from more2_jax.meshing.device.lattice import axis_places, corners, upsampled
 from more2_jax.meshing.device.neighbors import inliers, nearest_neighbors
@@ -64,18 +65,28 @@ def surface_values(prior: Prior, o: PaddedObject, config: MeshingConfig) -> Floa
     ask = partial(canonical_field, prior, o.embedding, field)
     asked = asked_cells(config)
     level = observed_level(ask, o) if config.level == "observed" else 0.0
-    values = ask(corners(asked, o.half_width)).reshape((asked + 1,) * 3) - level
+    coarse = ask(corners(asked, o.half_width)).reshape((asked + 1,) * 3) - level
+    values = coarse
     while len(values) - 1 < cells:
         values = upsampled(values)
     below = o.lowest - axis_places(cells, o.half_width)
     if config.mls_bandwidth:
-        planes = oriented_planes(ask, o)
-        drawn = jnp.maximum(values, below) if config.screening_length else values
-        if config.screening_length and asked < cells:
-            drawn = screened(drawn, planes, o, config)
-        drawn = corrected(drawn, planes, cells, o.half_width, config.mls_bandwidth)
+        drawn = drawn_to_points(ask, o, coarse, values, below, config)
         values = jnp.where(o.mask.sum() >= MIN_POINTS, drawn, values)
     return jnp.maximum(values, below)
+
+
+def drawn_to_points(
+    ask: Ask, o: PaddedObject, coarse: Grid, field: Grid, below: Float[Array, " r"], config: MeshingConfig
+) -> Grid:
+    """The field where there are points enough: inside and outside by these, near them their planes."""
+    planes, cells = oriented_planes(ask, o), config.resolution
+    if not (config.screening_length and len(coarse) < len(field)):
+        return corrected(field, planes, cells, o.half_width, config.mls_bandwidth)
+    field = screened(jnp.maximum(field, below), planes, o, config)
+    drawn = corrected(field, planes, cells, o.half_width, config.mls_bandwidth)
+    box = in_box(coarse, o.points, o.mask, cells, o.half_width, config.screening_length)
+    return jnp.where(box, drawn, jnp.maximum(drawn.max(), 2 * o.half_width / cells))
 
 
 def asked_cells(config: MeshingConfig) -> int:
