@@ -77,7 +77,12 @@ def surface_values(prior: Prior, o: PaddedObject, config: MeshingConfig) -> Floa
 
 
 def drawn_to_points(
-    ask: Ask, o: PaddedObject, coarse: Grid, field: Grid, below: Float[Array, " r"], config: MeshingConfig
+    ask: Ask,
+    o: PaddedObject,
+    coarse: Float[Array, "c c c"],
+    field: Float[Array, "r r r"],
+    below: Float[Array, " r"],
+    config: MeshingConfig,
 ) -> Grid:
     """The field where there are points enough: inside and outside by these, near them their planes."""
     planes, cells = oriented_planes(ask, o), config.resolution
