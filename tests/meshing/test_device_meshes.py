@@ -11,6 +11,7 @@ import trimesh
 from scipy.spatial import KDTree
 
 from more2_jax.config import MeshingConfig, preset
+from more2_jax.meshing import engine
 from more2_jax.meshing.device import batch
 from more2_jax.meshing.device.values import surface_values
 from more2_jax.meshing.engine import as_row, device_meshes, meshes_of_objects, on_device
@@ -158,59 +159,66 @@ def test_programs_are_as_many_as_sizes(prior, hard, made):
 
 
 @pytest.fixture(scope="module")
-def rows(tiny_prior):
-    counts = 200, 700, 1000
-    return [as_row(accumulated(tiny_prior, box_points(n, n, 0.01), 2), LITTLE) for n in counts]
+def noisy_boxes(tiny_prior):
+    return [accumulated(tiny_prior, box_points(n, n, 0.01), 2) for n in (200, 500, 700, 1000)]
 
 
-def vertices(surface, n):
-    return np.asarray(surface.vertices[n])[: int(surface.vertex_count[n])]
+@pytest.fixture(scope="module")
+def alone(tiny_prior, noisy_boxes):
+    """Each in a call of its own."""
+    return list(device_meshes(tiny_prior, noisy_boxes, LITTLE))
 
 
-def test_neither_padding_nor_order_nor_company_changes_a_surface(tiny_prior, rows):
-    alone = [batch.surfaces(tiny_prior, [o], LITTLE.meshing, 1) for o in rows]
-    together = batch.surfaces(tiny_prior, rows[::-1], LITTLE.meshing, 3)
-    wide = jax.tree.map(lambda *x: jnp.stack(x), *[batch.cut(o, 2048) for o in rows])
+def assert_equal(found, expected):
+    np.testing.assert_array_equal(found.faces, expected.faces)
+    np.testing.assert_allclose(found.vertices, expected.vertices, atol=1e-3)
+
+
+def meshes_of(surfaces, objects):
+    taken = [jax.tree.map(lambda x, n=n: np.asarray(x[n]), surfaces) for n in range(len(objects))]
+    rows = [as_row(o, LITTLE) for o in objects]
+    return [
+        batch.placed_mesh(s, o.embedding, float(r.half_width), LITTLE.meshing)
+        for s, o, r in zip(taken, objects, rows, strict=True)
+    ]
+
+
+def test_neither_padding_nor_order_nor_company_changes_a_mesh(tiny_prior, noisy_boxes, alone):
+    backward = [as_row(o, LITTLE) for o in noisy_boxes[::-1]]
+    together = batch.surfaces(tiny_prior, backward, LITTLE.meshing, 4)
+    wide = jax.tree.map(lambda *x: jnp.stack(x), *[batch.cut(o, 2048) for o in backward[:1]])
     padded = batch._surfaces(tiny_prior, wide, config=LITTLE.meshing)
-    for n, one in enumerate(alone):
-        assert int(one.vertex_count[0]) > 100
-        for other, at in ((together, 2 - n), (padded, n)):
-            np.testing.assert_allclose(vertices(other, at), vertices(one, 0), atol=2e-3)
-            np.testing.assert_array_equal(other.triangles[at], one.triangles[0])
+    for expected, found in zip(alone, meshes_of(together, noisy_boxes[::-1])[::-1], strict=True):
+        assert len(expected.vertices) > 100
+        assert_equal(found, expected)
+    assert_equal(meshes_of(padded, noisy_boxes[-1:])[0], alone[-1])
 
 
-def test_an_accelerator_makes_them_side_by_side(tiny_prior, monkeypatch):
+def test_an_accelerator_makes_them_side_by_side(tiny_prior, noisy_boxes, alone, monkeypatch):
     """As its programs are written: rows mapped over at once, fillers left out, no more drawn than memory holds."""
-    config = dataclasses.replace(
-        with_meshing(coarse_resolution=8, field_resolution=8, resolution=16, mls_bandwidth=0.021),
-        memory_mb=960,
-    )
-    objects = [accumulated(tiny_prior, box_points(n, n, 0.01), 2) for n in (200, 300, 400, 500)]
-    one_by_one = list(device_meshes(tiny_prior, objects, config))
-    drawn = []
+    drawn, config = [], dataclasses.replace(LITTLE, memory_mb=3 * engine.OBJECT_MB + 1)
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    config = dataclasses.replace(config, memory_mb=961)
-    jax.clear_caches()  # or the program of the CPU is taken
-    for n, mesh in enumerate(meshes_of_objects(tiny_prior, (drawn.append(o) or o for o in objects), config)):
+    jax.clear_caches()  # or the CPU's program is taken
+    objects = (drawn.append(o) or o for o in noisy_boxes)
+    for n, mesh in enumerate(meshes_of_objects(tiny_prior, objects, config)):
         assert len(drawn) == (3 if n < 3 else 4)
-        np.testing.assert_allclose(mesh.vertices, one_by_one[n].vertices, atol=1e-3)
-        np.testing.assert_array_equal(mesh.faces, one_by_one[n].faces)
+        assert_equal(mesh, alone[n])
     assert n == 3
     jax.clear_caches()
 
 
-def test_what_there_is_no_room_for_is_made_on_the_host(tiny_prior, monkeypatch):
-    o = accumulated(tiny_prior, box_points(300))
-    config = with_meshing(coarse_resolution=8, field_resolution=8, resolution=16, mls_bandwidth=0.022)
-    monkeypatch.setattr(batch, "ROOM", 1)
-    (mesh,) = device_meshes(tiny_prior, [o], config)
-    expected = object_mesh(tiny_prior, o, config)
-    assert mesh is not None and expected is not None
-    np.testing.assert_array_equal(mesh.vertices, expected.vertices)
+def test_what_there_is_no_room_for_is_made_on_the_host(tiny_prior, noisy_boxes, alone, monkeypatch):
+    """`IsoSurface` tells (`test_device_isosurface`); here the second has too little."""
+    most = sorted(len(m.vertices) for m in alone[:2])
+    monkeypatch.setattr(engine, "overflows", lambda s: int(s.vertex_count) == len(alone[1].vertices))
+    found = list(device_meshes(tiny_prior, noisy_boxes[:2], LITTLE))
+    assert most[0] != most[1]
+    assert_equal(found[0], alone[0])
+    np.testing.assert_array_equal(found[1].vertices, object_mesh(tiny_prior, noisy_boxes[1], LITTLE).vertices)
 
 
 @pytest.mark.parametrize(
-    ("engine", "backend", "device"),
+    ("chosen", "backend", "device"),
     [
         ("auto", "cpu", False),
         ("auto", "gpu", True),
@@ -219,9 +227,9 @@ def test_what_there_is_no_room_for_is_made_on_the_host(tiny_prior, monkeypatch):
         ("device", "cpu", True),
     ],
 )
-def test_the_backend_decides_unless_settings_do(monkeypatch, engine, backend, device):
+def test_the_backend_decides_unless_settings_do(monkeypatch, chosen, backend, device):
     monkeypatch.setattr(jax, "default_backend", lambda: backend)
-    assert on_device(MeshingConfig(engine=engine)) is device
+    assert on_device(MeshingConfig(engine=chosen)) is device
     assert MeshingConfig().engine == ROBUST.meshing.engine == "auto"
 
 
@@ -230,19 +238,25 @@ def test_a_resolution_not_reached_by_doubling_is_refused(tiny_prior):
         next(device_meshes(tiny_prior, [], with_meshing(resolution=48)))
 
 
-@pytest.mark.parametrize("cloud", ["box", "plane", "doubled"])
-def test_values_have_a_gradient_with_respect_to_points(tiny_prior, cloud):
+@jax.jit
+def slopes(prior, o):
+    def total(points):
+        values = surface_values(prior, dataclasses.replace(o, points=points), LITTLE.meshing)
+        return jnp.square(values).sum()
+
+    return jax.grad(total)(o.points)
+
+
+@pytest.mark.parametrize("cloud", ["box", "plane", "doubled", "one place"])
+def test_values_have_a_gradient_with_respect_to_points(tiny_prior, noisy_boxes, cloud):
     points = {
         "box": box_points(150, 1, 0.01),
         "plane": box_points(150, 1) * [1, 1, 0],
         "doubled": np.repeat(box_points(75, 1), 2, axis=0),
+        "one place": np.zeros((150, 3)) + [0.1, 0.0, 0.0],
     }[cloud]
-    o = jax.tree.map(jnp.asarray, batch.cut(as_row(accumulated(tiny_prior, points), LITTLE), 256))
-
-    def total(points):
-        values = surface_values(tiny_prior, dataclasses.replace(o, points=points), LITTLE.meshing)
-        return jnp.square(values).sum()
-
-    slope = np.asarray(jax.jit(jax.grad(total))(o.points))
-    assert np.isfinite(slope).all()
-    assert (np.abs(slope[: len(points)]).max(axis=1) > 0).mean() > 0.5 and not slope[len(points) :].any()
+    o = dataclasses.replace(noisy_boxes[0], points=points + WORLD_M, observation=np.arange(150) % 2)
+    row = jax.tree.map(jnp.asarray, batch.cut(as_row(o, LITTLE), 256))
+    slope = np.asarray(slopes(tiny_prior, row))
+    assert np.isfinite(slope).all() and not slope[150:].any()
+    assert cloud == "one place" or (np.abs(slope[:150]).max(axis=1) > 0).mean() > 0.5
