@@ -159,8 +159,8 @@ def distances_cm(a: Mesh, b: Mesh) -> tuple[float, float]:
     """Mean and 99th percentile of how far samples of either lie from the plane of the other's nearest sample."""
     found = []
     for one, other in ((a, b), (b, a)):
-        points, face = trimesh.sample.sample_surface(solid(one), SAMPLES, seed=0)
-        asked, _ = trimesh.sample.sample_surface(solid(other), ASKED, seed=1)
+        points, face = trimesh.sample.sample_surface(solid(one), SAMPLES, seed=0)[:2]
+        asked = trimesh.sample.sample_surface(solid(other), ASKED, seed=1)[0]
         asked = asked + other.vertices.mean(axis=0) - one.vertices.mean(axis=0)
         near = KDTree(points).query(asked)[1]
         off = np.einsum("ni,ni->n", asked - points[near], solid(one).face_normals[face[near]])
