@@ -14,7 +14,7 @@ from more2_jax.meshing.device import screened as device_screened
 from more2_jax.meshing.device.correction import OrientedPlanes, corrected
 from more2_jax.meshing.device.neighbors import inliers, nearest_neighbors
 from more2_jax.meshing.device.rows import evenly, masked_median, true_places
-from more2_jax.meshing.device.sides import Cloud, Views, outward_signs
+from more2_jax.meshing.device.sides import Cloud, Views, free_distance, outward_signs
 from more2_jax.meshing.observed_surface import ObservedSurface, fit_observed_surface
 
 SIZE, CELLS, HALF = 700, 32, np.float32(0.65)
@@ -99,6 +99,27 @@ def test_planes_are_the_same_but_for_their_sign(name):
     agree = np.abs((np.asarray(found.normal)[: len(points)] * expected).sum(axis=1))[told]
     assert told.mean() > 0.5 and (agree > 0.999).mean() > 0.97  # beside an edge two planes may fit as well
     assert float(found.residual) == pytest.approx(residual, abs=1e-4)
+
+
+@pytest.mark.parametrize(("lowest", "slope"), [(-np.inf, 0.45), (-0.2, 0.45), (-np.inf, 0.25)])
+def test_rays_go_as_far_as_by_tree(lowest, slope):
+    """Also past the origin, where padding lies."""
+    points, outward = box_cloud(600, np.random.default_rng(2))
+    points = points.astype(np.float32).astype(np.float64)
+    _, _, d, neighbors = searched(points)
+    cloud = Cloud(
+        points=jnp.asarray(padded(points)),
+        mask=real(points),
+        distance=jnp.asarray(d),
+        neighbors=jnp.asarray(neighbors),
+        gap=jnp.float32(0.1),
+        lowest=jnp.float32(lowest),
+    )
+    for way in (outward, -outward, np.roll(outward, 1, axis=1)):
+        expected = normal_orientation.free_distance(KDTree(points), points, way, 0.1, lowest, slope)
+        found = free_distance(cloud, jnp.asarray(points, jnp.float32), jnp.asarray(way, jnp.float32), slope)
+        assert np.isclose(found, expected, rtol=1e-5).mean() > 0.995  # but for points on a cone's border
+    assert (expected < 1).mean() > 0.2
 
 
 @pytest.mark.parametrize("known", ["nothing", "sensors", "normals"])
