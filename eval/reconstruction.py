@@ -31,7 +31,7 @@ from eval.scores.figures import Column, Figure, Record
 from eval.scores.mesh_scores import RECONSTRUCTED, mesh_scores
 from more2_jax.config import SceneConfig, preset
 from more2_jax.geometry.poses import apply_pose, turned
-from more2_jax.meshing.object_mesh import object_mesh
+from more2_jax.meshing.engine import meshes_of_objects
 from more2_jax.network.prior import Prior
 from more2_jax.refinement.joint_of_objects import fit_objects
 from more2_jax.scene import remembered
@@ -177,7 +177,7 @@ def work(
     records = []
     for name, (objects, spent_s) in zip(names, both if config.joint.steps else both[::-1], strict=True):
         records += [
-            scored(s, name, lambda own=own: object_mesh(prior, own, config), spent_s, o.samples)
+            scored(s, name, lambda own=own: next(meshes_of_objects(prior, [own], config)), spent_s, o.samples)
             for s, own in zip(seen, objects, strict=True)
         ]
     for name, surface in peers.items():
