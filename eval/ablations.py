@@ -29,7 +29,7 @@ from eval.scores.mesh_scores import RECONSTRUCTED, mesh_scores
 from eval.scores.pose_scores import pose_scores
 from more2_jax.config import CodeMatcher, JointConfig, SceneConfig
 from more2_jax.geometry.observations import with_poses
-from more2_jax.meshing.object_mesh import object_mesh
+from more2_jax.meshing.engine import meshes_of_objects
 from more2_jax.network.prior import Prior
 from more2_jax.types import AccumulatedObject, ObservedObject
 
@@ -206,7 +206,9 @@ def joint_records(
     """One record of each object's mesh, and one of each of its poses."""
     found = []
     for s, own in zip(seen, objects, strict=True):
-        scores = mesh_scores(object_mesh(prior, own, config), s.known, s.known.T_scan_model[0], samples)
+        scores = mesh_scores(
+            next(meshes_of_objects(prior, [own], config)), s.known, s.known.T_scan_model[0], samples
+        )
         found.append((s.scene.name, {"method": method, "object": s.known.name, **scores}))
         target = s.scene.instance(0, s.known.instance[0]).points
         for o, T_ref_scan in zip(s.observations[1:], own.poses[1:], strict=True):

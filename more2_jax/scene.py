@@ -14,7 +14,7 @@ from jaxtyping import Float
 from more2_jax.config import EvidenceMatcher, SceneConfig
 from more2_jax.geometry.poses import Points, Pose, apply_pose
 from more2_jax.matching.color import color_of
-from more2_jax.meshing.object_mesh import object_meshes
+from more2_jax.meshing.engine import meshes_of_objects
 from more2_jax.network.embedding_batch import embed
 from more2_jax.network.prior import Prior
 from more2_jax.network.shared_calls import side_by_side
@@ -211,7 +211,7 @@ def reconstruct(
         fitted = fit_objects(prior, list(accumulated_objects(objects, fit, scene.scans)), config)
         objects = with_refined(objects, fit, fitted)
     with staged(timing, progress, "mesh", len(todo)) as advance:
-        meshes = object_meshes(prior, accumulated_objects(objects, todo, scene.scans), config)
+        meshes = meshes_of_objects(prior, accumulated_objects(objects, todo, scene.scans), config)
         for done, (k, mesh) in enumerate(zip(todo, meshes, strict=True), start=1):
             objects[k] = dataclasses.replace(objects[k], mesh=mesh)
             advance(done)

@@ -1,8 +1,9 @@
 """Scores of one mesh against the true one (paper §4), in three columns.
 
 `paper`: the printed formulas, canonical units (longest edge 0.9). `published`: as the published code computes them:
-its Chamfer-L1 is squared and against vertices, its IoU the share of true vertices inside. `strict`: meters, true
-IoU, and distances from samples of one surface to the other surface itself. Between samples of both even equal
+its Chamfer-L1 is squared and against vertices, its IoU the share of true vertices inside. `one_way`: the half of a
+Chamfer-L1 that goes from the truth, which may be incomplete, to the mesh (3RScan). `strict`: meters, true IoU, and
+distances from samples of one surface to the other surface itself. Between samples of both even equal
 surfaces are apart by half the spacing: 0.5 cm of furniture at 20,000 samples.
 """
 
@@ -30,6 +31,8 @@ RECALL_SAMPLES = 4_000
 DISTANCES: tuple[str, ...] = (
     "chamfer.paper",
     "chamfer.published",
+    "one_way.paper",
+    "one_way.published",
     "chamfer_m.strict",
     "accuracy_m",
     "completeness_m",
@@ -68,14 +71,15 @@ def mesh_scores(mesh: Mesh | None, truth: KnownObject, T_frame_model: Pose, samp
     recalled = true_points[:: max(1, len(true_points) // RECALL_SAMPLES)]
     there = to_surface(points, true)
     back, of_recalled, of_vertices = all_to_surface((true_points, recalled, true.vertices), found)
-    sampled = KDTree(true_points).query(points)[0].mean() + KDTree(points).query(true_points)[0].mean()
+    sampled = [float(KDTree(b).query(a)[0].mean()) for a, b in ((points, true_points), (true_points, points))]
     tolerance = TOLERANCE * float(np.linalg.norm(np.ptp(true.vertices, axis=0)))
     near = NEAR / truth.canonical
     published = _published(found, true, points, truth.canonical)
     published["recall.published"] = sdf_recall(of_vertices, near)
     return {
         **published,
-        "chamfer.paper": float(sampled) / 2 * truth.canonical,
+        "chamfer.paper": sum(sampled) / 2 * truth.canonical,
+        "one_way.paper": sampled[1] * truth.canonical,
         "chamfer_m.strict": float(there.mean() + back.mean()) / 2,
         "accuracy_m": float(there.mean()),
         "completeness_m": float(back.mean()),
@@ -94,6 +98,7 @@ def _published(found: trimesh.Trimesh, true: trimesh.Trimesh, points: Points, ca
     there, back = KDTree(vertices).query(some)[0], KDTree(some).query(vertices)[0]
     return {
         "chamfer.published": float((there**2).mean() + (back**2).mean()) * canonical**2,
+        "one_way.published": float((back**2).mean()) * canonical**2,
         "iou.published": float(enclosed(found, vertices).mean()),
     }
 

@@ -194,13 +194,15 @@ def horn_matrix(h: Float[Array, "3 3"]) -> Float[Array, "4 4"]:
     return jnp.block([[trace[None, None], vector[None]], [vector[:, None], block]])
 
 
-def dominant_eigenvector(matrix: Float[Array, "4 4"]) -> Float[Array, "4"]:
+def dominant_eigenvector(matrix: Float[Array, "d d"]) -> Float[Array, " d"]:
     """Unit eigenvector of the largest eigenvalue of a symmetric matrix; its gradient is finite everywhere.
 
-    Where the largest eigenvalue is repeated, some unit vector of its space; of a zero matrix, (1, 0, 0, 0).
+    Where the largest eigenvalue is repeated, some unit vector of its space; of a zero matrix, (1, 0, …).
     """
     size = jnp.sqrt(jnp.sum(matrix * matrix) + TINY)
-    power = matrix / size + jnp.eye(4, dtype=matrix.dtype)  # eigenvalues in [0, 2]: the largest dominates
+    power = matrix / size + jnp.eye(
+        len(matrix), dtype=matrix.dtype
+    )  # eigenvalues in [0, 2]: the largest dominates
     for _ in range(20):
         power = jnp.matmul(power, power, precision="highest")
         power = power / jnp.trace(power)

@@ -70,7 +70,7 @@ def extract_mesh(
     height `floor`. Returns None if the field stays above `level` in the box. Raises ValueError unless `resolution` is
     `coarse_resolution` times a power of two.
     """
-    _check(config)
+    check_resolutions(config)
     lowest = lowest_height(embedding, floor)
     surface = observed_surface(prior, embedding, seen, config, lowest, seen_from, normals)
     field = partial(_field, prior, embedding, level)
@@ -124,7 +124,8 @@ def lowest_height(embedding: Embedding, floor: float | None) -> float:
     return -np.inf if floor is None else float(canonical(embedding, np.array([[0.0, 0.0, floor]]))[0, 2])
 
 
-def _check(config: MeshingConfig) -> None:
+def check_resolutions(config: MeshingConfig) -> None:
+    """Raises ValueError unless the last grid is the first one with its step halved some times."""
     doublings = np.log2(config.resolution / config.coarse_resolution)
     if doublings < 0 or doublings != int(doublings):
         raise ValueError(

@@ -40,10 +40,10 @@ def in_turn(
     return share(shared, rows)
 
 
-def chunked(function: Callable[[Tree], Tree], size: int, rows: Tree) -> Tree:
+def chunked(function: Callable[[Tree], Tree], size: int, rows: Tree, wider: int = WIDER) -> Tree:
     """`function` of `rows` (leading axis b), in calls of `size` rows each: one compiled program whatever b is.
 
-    Accelerators take `WIDER` times as many; several local devices take calls in turn, side by side. The last call is
+    Accelerators take `wider` times as many; several local devices take calls in turn, side by side. The last call is
     filled up with its first row; of no rows there is none. Where scenes are worked on side by side (`shared_calls`),
     the last call is made with rows of other scenes. Where anything is traced, the number of rows is part of a
     larger program anyway: they go in one call. Results are host arrays, but for traced ones.
@@ -52,17 +52,21 @@ def chunked(function: Callable[[Tree], Tree], size: int, rows: Tree) -> Tree:
         return function(rows)
     host = jax.tree.map(np.asarray, rows)
     count = len(jax.tree.leaves(host)[0])
-    return chunked_at(function, size, count, lambda at: jax.tree.map(lambda x: x[at], host))
+    return chunked_at(function, size, count, lambda at: jax.tree.map(lambda x: x[at], host), wider)
 
 
 def chunked_at(
-    function: Callable[[Tree], Tree], size: int, count: int, taken: Callable[[Int[np.ndarray, " k"]], Tree]
+    function: Callable[[Tree], Tree],
+    size: int,
+    count: int,
+    taken: Callable[[Int[np.ndarray, " k"]], Tree],
+    wider: int = WIDER,
 ) -> Tree:
     """`chunked` of `count` rows that are made for every call anew: `taken` gives those at some places.
 
     What many rows share (an object that is part of many pairs) is so never held once a row.
     """
-    size = size if jax.default_backend() == "cpu" else WIDER * size
+    size = size if jax.default_backend() == "cpu" else wider * size
     if not count:
         return _of_no_rows(function, taken(np.zeros(0, int)))
     shared, over = CURRENT.get(), count % size

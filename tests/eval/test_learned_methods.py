@@ -12,7 +12,7 @@ from known_scenes import pose
 from places import ROOT
 from sphere_shards import sphere_shards
 
-from eval.peers.learned import methods, registry, train
+from eval.peers.learned import methods, registry, train, validation
 from eval.peers.learned.clouds import centered
 from eval.peers.learned.occupancy_mesh import LEVEL, surface
 from eval.peers.learned.registry import LearnedPeer, Trained, Training, load, save, shipped, start
@@ -162,6 +162,32 @@ def test_a_peer_learns_and_repeats_exactly(with_tiny, tmp_path, monkeypatch):
     assert all(np.array_equal(x, y) for x, y in zip(*map(jax.tree.leaves, (a.params, b.params)), strict=True))
     moved = zip(jax.tree.leaves(a.params), jax.tree.leaves(with_tiny.params), strict=True)
     assert any(np.abs(x - y).max() > 1e-3 for x, y in moved)
+
+
+def test_validation_draws_the_same_shapes_for_all_weights(with_tiny, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(train, "SAMPLES", SampleConfig(queries=16, raw_points=64, max_views=2))
+
+    def inside_and_weight(network, params, sample, key):
+        return (sample.sdf < 0).mean() + jax.tree.leaves(params)[0].sum()
+
+    monkeypatch.setitem(registry.PEERS, "tiny", tiny(loss=inside_and_weight, points=33))
+    open_shapes = ROOT / "train/shapes/open.npz"
+    shapes, rows = train.load_mix((open_shapes,), "val")
+    zeros = dataclasses.replace(with_tiny, params=jax.tree.map(jnp.zeros_like, with_tiny.params))
+    ones = dataclasses.replace(zeros, params={"a": jnp.ones(2)})
+    found = [
+        validation.losses_of(t, shapes, jnp.asarray(rows), 3, seed) for t, seed in ((zeros, 0), (ones, 0))
+    ]
+    np.testing.assert_allclose(found[1] - found[0], 2, atol=1e-5)
+    assert len(set(found[0].tolist())) > 1 and (found[0] > 0).all() and (found[0] < 0.5).all()
+    assert not np.array_equal(validation.losses_of(zeros, shapes, jnp.asarray(rows), 3, 1), found[0])
+    monkeypatch.setitem(registry.PEERS, "tiny", tiny(loss=inside_and_weight))
+    save(zeros, tmp_path / "tiny.npz")
+    validation.main((str(tmp_path / "tiny.npz"),), (open_shapes,), batches=2)
+    said = capsys.readouterr().out.splitlines()
+    assert [line.split(":")[0] for line in said] == ["tiny, 0 steps", "tiny, 3 steps"]
+    with pytest.raises(ValueError, match="batches 1; needed 2"):
+        validation.main((str(tmp_path / "tiny.npz"),), (open_shapes,), batches=1)
 
 
 def test_matching_is_by_the_nearest_code(with_tiny):

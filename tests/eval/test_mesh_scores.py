@@ -114,6 +114,8 @@ def test_distances_against_all_pairs():
     assert found["chamfer.published"] == pytest.approx(
         0.81 * (squared.min(axis=1).mean() + squared.min(axis=0).mean())
     )
+    assert found["one_way.paper"] == pytest.approx(0.9 * between.min(axis=0).mean())
+    assert found["one_way.published"] == pytest.approx(0.81 * squared.min(axis=0).mean())
     radius = np.linalg.norm(BOX.vertices, axis=1)
     assert found["iou.published"] == pytest.approx(np.mean(radius < 0.4), abs=0.02)
     assert found["recall.published"] == pytest.approx(np.mean(np.abs(radius - 0.4) < 0.05 / 0.9), abs=0.02)
@@ -124,6 +126,18 @@ def test_iou_of_half_a_box():
     found = mesh_scores(mesh_of(half), TRUTH, np.eye(4), 20_000)
     assert found["iou.paper"] == pytest.approx(0.5, abs=0.02)
     assert found["watertight"] == 1
+
+
+def test_one_way_what_lies_beyond_an_incomplete_truth_costs_nothing():
+    """A truth that ends where its scan does: half of the box. The whole box covers it; the other half does not."""
+    half = trimesh.creation.box((0.5, 0.6, 0.4), transform=pose(0, [0.25, 0, 0])).subdivide().subdivide()
+    cut = trimesh.Trimesh(half.vertices, half.faces[half.triangles_center[:, 0] > 1e-6], process=False)
+    cut.remove_unreferenced_vertices()
+    seen = dataclasses.replace(TRUTH, mesh=mesh_of(cut))
+    whole = mesh_scores(mesh_of(BOX), seen, np.eye(4), 20_000)
+    assert whole["one_way.published"] < 1e-3 and whole["one_way.paper"] < 0.01 < 0.05 < whole["chamfer.paper"]
+    other = trimesh.creation.box((0.5, 0.6, 0.4), transform=pose(0, [-0.25, 0, 0]))
+    assert mesh_scores(mesh_of(other), seen, np.eye(4), 20_000)["one_way.paper"] > 0.15
 
 
 def test_an_open_surface_encloses_by_winding():

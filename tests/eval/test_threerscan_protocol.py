@@ -108,6 +108,8 @@ def test_every_program_scores_it(rooms, tmp_path, tiny_prior, program):
     assert found["settings"]["data"]["dataset"] == "3RScan"
     counted = {r["method"] for r in found["rows"] if r["group"] == "all" and r["count"]}
     assert f"ours, {options.preset}" in counted
+    one_way = {r["column"] for r in found["rows"] if r["name"] == "Chamfer-L1, one way" and r["count"]}
+    assert one_way == ({"paper", "published"} if program is reconstruction else set())
 
 
 def test_several_presets_are_scored_side_by_side(rooms, tmp_path, tiny_prior):

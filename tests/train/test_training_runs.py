@@ -12,6 +12,7 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
+from compiling import LITTLE
 from places import ROOT
 from sphere_shards import sphere_shards
 
@@ -27,6 +28,7 @@ model:
 training: {steps: 60, batch: 8, learning_rate: 1.0e-3, queries: 32, raw_points: 64, max_views: 2, warmup_steps: 2,
            validate_every: 20, picture_every: 1000}
 """
+FEW = SETTINGS.replace("steps: 60", "steps: 4").replace("validate_every: 20", "validate_every: 2")
 MINUTES = 10  # a subprocess may take, on a machine that is busy
 
 STEPS_ON_ONE_AND_FOUR = """
@@ -61,6 +63,22 @@ for count in (1, 4):
 print(json.dumps(found))
 """
 
+LET_BE_THEN_KILLED_AT_A_CHECKPOINT = """
+import os, signal, sys
+from pathlib import Path
+from train import prior
+
+def keep(manager, step, state, score=None, saved=prior.keep):
+    saved(manager, step, state, score)
+    manager.wait_until_finished()
+    os.kill(os.getpid(), signal.SIGKILL)
+
+folder = Path(sys.argv[1])
+prior.main(folder / "settings.yaml", (folder,), folder / "let_be")
+prior.keep = keep
+prior.main(folder / "settings.yaml", (folder,), folder / "killed")
+"""
+
 CHOOSES_DEVICES = """
 import sys
 import jax
@@ -81,13 +99,15 @@ def made(tmp_path_factory) -> Path:
     return folder
 
 
-def started(folder: Path, out: str, *more: str, devices: int = 1) -> subprocess.Popen:
+def started(folder: Path, out: str, *more: str, devices: int = 1, quickly: bool = False) -> subprocess.Popen:
     files = ["--config", str(folder / "settings.yaml"), "--shards", str(folder), "--out", str(folder / out)]
-    return program(["-m", "train.prior", *files, *more], devices)
+    return program(["-m", "train.prior", *files, *more], devices, quickly)
 
 
-def program(arguments: list[str], devices: int = 1) -> subprocess.Popen:
+def program(arguments: list[str], devices: int = 1, quickly: bool = False) -> subprocess.Popen:
+    """A process with so many devices; `quickly`: that compiles as tests do, not as for users."""
     environment = os.environ | {
+        LITTLE.upper(): str(quickly),
         "JAX_PLATFORMS": "cpu",
         "XLA_FLAGS": f"--xla_force_host_platform_device_count={devices}",
         "PYTHONPATH": str(ROOT),
@@ -122,10 +142,26 @@ def test_four_devices_take_the_steps_of_one_each_doing_its_share(made):
     assert four["flops"] < 0.28 * one["flops"]
 
 
+def test_in_short_a_run_on_two_devices_is_that_on_one_and_resumes_bit_for_bit(tmp_path):
+    """What the slow tests below try at length."""
+    (tmp_path / "settings.yaml").write_text(FEW)
+    sphere_shards(tmp_path)
+    killed = program(["-c", LET_BE_THEN_KILLED_AT_A_CHECKPOINT, str(tmp_path)], 2, quickly=True)
+    _, err = killed.communicate(timeout=60 * MINUTES)
+    assert killed.returncode == -signal.SIGKILL, err[-2000:]
+    assert (tmp_path / "killed" / "checkpoints" / "2").exists() and len(logs(tmp_path, "killed")[0]) == 1
+    finish(started(tmp_path, "killed", devices=2, quickly=True))
+    for name in ("weights.npz", "best.npz"):
+        np.testing.assert_array_equal(*(weights(tmp_path / k / name) for k in ("let_be", "killed")))
+    finish(started(tmp_path, "one", quickly=True))
+    for a, b, one in zip(*logs(tmp_path, "let_be", "killed", "one"), strict=True):
+        assert (a["step"], a["train"], a["val"]) == (b["step"], b["train"], b["val"])
+        assert a["step"] == one["step"] and a["train"] == pytest.approx(one["train"], rel=1e-3)
+
+
 @pytest.mark.slow
 def test_two_processes_end_where_one_does(tmp_path):
-    few = SETTINGS.replace("steps: 60", "steps: 4").replace("validate_every: 20", "validate_every: 2")
-    (tmp_path / "settings.yaml").write_text(few)
+    (tmp_path / "settings.yaml").write_text(FEW)
     sphere_shards(tmp_path)
     with socket.socket() as free:
         free.bind(("localhost", 0))
