@@ -7,7 +7,7 @@ For other weights of the prior, or other kinds of rooms. Never on rooms that res
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -21,7 +21,7 @@ from scipy.special import expit
 
 from eval.data.flyingshape import flyingshape
 from eval.data.masks import DAMAGES, with_masks
-from eval.data.truth import KnownScene
+from eval.data.truth import Benchmark, KnownScene
 from eval.harness.options import Masks
 from eval.harness.plots import draw_reliability
 from eval.scores.reliability import Bin, calibration_error, reliability
@@ -97,12 +97,8 @@ def main(
             "folders of upright rooms and of others; needed one kind, as each has its own weights"
         )
     config, weights = preset("robust", upright=rooms[0].upright), load_prior(prior)
-    pairs: list[ScanPair] = []
-    for folder, benchmark in zip(data, rooms, strict=True):
-        for name in track(benchmark.names[: scenes or None], description=folder.name):
-            scene = benchmark.read(name).first_scans(visits)
-            seen = [with_masks(scene, DAMAGES[m]) if m in DAMAGES else scene for m in masks]
-            pairs += [p for s in seen for p in scan_pairs(f"{folder}/{name}", s, weights, config)]
+    seen = scenes_of(list(zip(data, rooms, strict=True)), visits, scenes, masks)
+    pairs = [p for room, scene in seen for p in scan_pairs(room, scene, weights, config)]
     if not pairs:
         raise ValueError(f"{', '.join(map(str, data))}: no room with two scans; needed one")
     report(pairs, asked(config), taken_away)
@@ -111,6 +107,17 @@ def main(
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
         draw_reliability(out / "reliability", curves)
+
+
+def scenes_of(
+    rooms: Sequence[tuple[Path, Benchmark]], visits: int, scenes: int, masks: Sequence[Masks]
+) -> Iterator[tuple[str, KnownScene]]:
+    """Every room through each of the masks, with its name."""
+    for folder, benchmark in rooms:
+        for name in track(benchmark.names[: scenes or None], description=folder.name):
+            scene = benchmark.read(name).first_scans(visits)
+            for m in masks:
+                yield f"{folder}/{name}", with_masks(scene, DAMAGES[m]) if m in DAMAGES else scene
 
 
 def asked(config: SceneConfig) -> dict[str, Calibration]:
