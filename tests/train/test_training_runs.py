@@ -142,6 +142,7 @@ def test_four_devices_take_the_steps_of_one_each_doing_its_share(made):
     assert four["flops"] < 0.28 * one["flops"]
 
 
+@pytest.mark.begins
 def test_in_short_a_run_on_two_devices_is_that_on_one_and_resumes_bit_for_bit(tmp_path):
     """What the slow tests below try at length."""
     (tmp_path / "settings.yaml").write_text(FEW)
