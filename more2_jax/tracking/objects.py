@@ -57,7 +57,7 @@ def new_objects(
 def next_number(objects: Sequence[SceneObject], scans: Sequence[ScanRecord]) -> int:
     """One that no object has or had: ids of objects that were parts of others are not given again."""
     ids = [o.id for o in objects] + [id_ for s in scans for r in s.repairs for id_ in r.absorbed]
-    return 1 + max((int(id_.rpartition("_")[2]) for id_ in ids), default=-1)
+    return 1 + max(map(number_in, ids), default=-1)
 
 
 def seen_again(o: SceneObject, instance: Instance, seen: Observation) -> SceneObject:
@@ -113,7 +113,12 @@ def reference_pose(o: SceneObject) -> Pose:
 
 def number_of(o: SceneObject) -> int:
     """That of its id: 3 of `object_003`. It is no place in `LivingScene.objects`: joined parts leave gaps."""
-    return int(o.id.rpartition("_")[2])
+    return number_in(o.id)
+
+
+def number_in(id_: str) -> int:
+    """3 of `object_003`."""
+    return int(id_.rpartition("_")[2])
 
 
 def observation_in(o: SceneObject, scan: int) -> Observation | None:
