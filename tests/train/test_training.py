@@ -201,11 +201,23 @@ def test_a_source_named_twice_is_held_once_and_drawn_twice_as_often(shards, tmp_
     packed = tmp_path / "small.npz"
     pack.main((shards,), packed, shapes=5, val=2, views=4, points=64, queries=30)
     shapes, rows = load_mix((shards, packed, shards), "train")
-    assert len(shapes.views) == 32 + 5 and shapes.sdf_near.shape[1] == 30
+    assert len(shapes.views) == 32 + 5
     assert sorted(np.bincount(rows)) == [1] * 5 + [2] * 32
-    pack.main((shards,), packed, shapes=5, val=2, views=3, points=64, queries=30)
-    with pytest.raises(ValueError, match="views and points a shape differ"):
-        load_mix((shards, packed), "train")
+
+
+def test_rows_of_a_smaller_source_are_repeated(shards, tmp_path):
+    packed = tmp_path / "small.npz"
+    pack.main((shards,), packed, shapes=5, val=2, views=3, points=20, queries=30)
+    shapes, _ = load_mix((shards, packed), "train")
+    alone, _ = load_mix((packed,), "train")
+    views, points = open_shards(shards, "train")[0]["views"].shape[:2]
+    assert views > 3 and points > 20 and shapes.views.shape == (37, views, points, 3)
+    for v in range(views):
+        np.testing.assert_array_equal(
+            shapes.views[32:, v], np.asarray(alone.views)[:, v % 3, np.arange(points) % 20]
+        )
+    queries = np.arange(shapes.sdf_near.shape[1]) % 30
+    np.testing.assert_array_equal(shapes.sdf_near[32:], np.asarray(alone.sdf_near)[:, queries])
 
 
 def test_a_resumed_log_forgets_what_was_lost_and_what_was_half_written(tmp_path):

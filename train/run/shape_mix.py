@@ -23,7 +23,9 @@ class ShapeMix:
 
     views: tuple[ShardView, ...]  # of each source
     rows: Int[np.ndarray, " rows"]  # to draw from: a shape of a source named twice stands there twice
-    queries: Mapping[str, int]  # how many of each kind are read of a shape
+    sizes: Mapping[
+        str, tuple[int, ...]
+    ]  # of every array, how many rows of a shape are read: queries; views, points
 
     def __len__(self) -> int:
         return sum(map(len, self.views))
@@ -42,7 +44,7 @@ class ShapeMix:
             source = int(np.searchsorted(first, i, side="right")) - 1
             stored = self.views[source][i - first[source]]
             for name, kept in rows.items():
-                kept.append(stored[name][: self.queries.get(name)])
+                kept.append(repeated(stored[name], self.sizes[name]))
             scanned.append(bool(stored.get("scanned", False)))
         return Shapes(**{name: np.stack(kept) for name, kept in rows.items()}, scanned=np.array(scanned))  # pyright: ignore[reportArgumentType]
 
@@ -50,21 +52,24 @@ class ShapeMix:
 def open_mix(sources: Sequence[Path], split: str) -> ShapeMix:
     """Opens the shapes of a split ('train', 'val', 'test').
 
-    A source is a folder of shards, which stays on disk, or a file of `train.tools.pack`. Raises ValueError where the
-    split is empty or sources differ in views or points a shape; queries are cut to the smallest source's.
+    A source is a folder of shards, which stays on disk, or a file of `train.tools.pack`. Where sources differ in views,
+    points or queries a shape, the rows of the smaller ones are repeated. Raises ValueError where the split is empty.
     """
     once = list(dict.fromkeys(sources))
     views = tuple(
         in_memory(read_shapes(s, split)) if s.suffix == ".npz" else open_shards(s, split) for s in once
     )
-    shape = [{name: array.shape for name, array in view[0].items()} for view in views]
-    if len({s["views"] for s in shape}) > 1:
-        got = ", ".join(f"{path}: {s['views'][:2]}" for path, s in zip(once, shape, strict=True))
-        raise ValueError(f"views and points a shape differ ({got}); needed the same in all sources")
     first = np.cumsum([0, *map(len, views)])
     rows = np.concatenate([np.arange(first[k], first[k + 1]) for k in map(once.index, sources)])
-    least = {n: min(MOST_QUERIES, *(s[n][0] for s in shape)) for n in ("sdf_uniform", "sdf_near")}
-    return ShapeMix(views=views, rows=rows, queries=least)
+    shapes = [{name: view[0][name].shape[:-1] for name in MAPPED} for view in views]
+    largest = {name: np.max([s[name] for s in shapes], axis=0).tolist() for name in MAPPED}
+    sizes = {n: tuple(size if len(size) > 1 else [min(MOST_QUERIES, *size)]) for n, size in largest.items()}
+    return ShapeMix(views=views, rows=rows, sizes=sizes)
+
+
+def repeated(rows: np.ndarray, sizes: tuple[int, ...]) -> np.ndarray:
+    """The first rows of every axis but the last, so many; from the first again where there are fewer."""
+    return rows[np.ix_(*(np.arange(n) % have for n, have in zip(sizes, rows.shape, strict=False)))]
 
 
 def in_memory(shapes: Shapes) -> ShardView:
