@@ -25,7 +25,7 @@ class ShapeMix:
     rows: Int[np.ndarray, " rows"]  # to draw from: a shape of a source named twice stands there twice
     sizes: Mapping[
         str, tuple[int, ...]
-    ]  # of every array, how many rows of a shape are read: queries; views, points
+    ]  # of each array of a shape, what is read: queries, or views and points
 
     def __len__(self) -> int:
         return sum(map(len, self.views))
