@@ -52,7 +52,7 @@ def same(first, second):
 def test_from_disk_come_the_shapes_that_memory_holds(mix):
     from_memory = drawn(resident(mix, CONFIG, MESH), 0, 8)
     same(from_memory, drawn(streamed(mix, CONFIG, MESH), 0, 8))
-    assert from_memory[0].views.shape == (4, 4, 64, 3) and from_memory[0].sdf_near.shape == (4, 30, 4)
+    assert from_memory[0].views.shape == (4, 4, 64, 3) and from_memory[0].sdf_near.shape == (4, 200, 4)
     assert not np.array_equal(from_memory[0].views, from_memory[1].views)
 
 
