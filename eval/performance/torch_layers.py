@@ -133,9 +133,8 @@ def main() -> None:
     """Serves timings until the input ends."""
     settings = json.loads(sys.stdin.readline())
     torch.set_num_threads(settings["threads"])
-    if (
-        on_gpu := torch.cuda.is_available()
-    ):  # there both frameworks multiply as fast as float32 allows, which is TF32
+    # On a GPU both frameworks multiply as fast as float32 allows, which is TF32.
+    if on_gpu := torch.cuda.is_available():
         torch.set_default_device("cuda")
         torch.set_float32_matmul_precision("high")
     torch.manual_seed(0)

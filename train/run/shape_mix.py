@@ -23,9 +23,8 @@ class ShapeMix:
 
     views: tuple[ShardView, ...]  # of each source
     rows: Int[np.ndarray, " rows"]  # to draw from: a shape of a source named twice stands there twice
-    sizes: Mapping[
-        str, tuple[int, ...]
-    ]  # of each array of a shape, what is read: queries, or views and points
+    # How many rows of each of a shape's arrays are read: queries, or views and points.
+    sizes: Mapping[str, tuple[int, ...]]
 
     def __len__(self) -> int:
         return sum(map(len, self.views))
