@@ -22,7 +22,9 @@ import tyro
 
 from eval.data.flyingshape import flyingshape
 from eval.harness.plots import pyplot, save
+from eval.harness.results import cost, write_rows
 from eval.performance.stopwatch import Seconds
+from eval.scores.figures import Row
 from more2_jax.config import PresetName, preset
 from more2_jax.network.prior import load_prior
 from more2_jax.progress import Progress
@@ -89,12 +91,26 @@ def main(options: Annotated[Settings, tyro.conf.arg(name="")]) -> None:
         print(json.dumps(asdict(measured(options, options.one))))
         return
     options.out.mkdir(parents=True, exist_ok=True)
-    file, rows = options.out / "results.json", list[dict[str, Any]]()
+    sizes = list[dict[str, Any]]()
     for count in options.objects:
-        rows.append(in_own_process(count))
-        file.write_text(json.dumps(rows, indent=1))
-        print(json.dumps(rows[-1]))
-    draw(options.out / "building", rows)
+        sizes.append(in_own_process(count))
+        rows = [row for size in sizes for row in rows_of(size)]
+        write_rows(options.out, rows, program="building", sizes=sizes)
+        print(json.dumps(sizes[-1]))
+        draw(options.out / "building", sizes)
+
+
+def rows_of(size: dict[str, Any]) -> list[Row]:
+    """One size as rows of results.json."""
+    method, count = f"{size['objects']} objects", size["true"]
+    share = 100 * size["right"] / max(count, 1)
+    right = cost("right pairs", method, share, "%", count=count, scenes=1)
+    return [
+        cost("points", method, size["points"], "", count=count),
+        cost("processor time", method, sum(size["cpu_seconds"].values()), "s", count=count),
+        cost("peak memory", method, max(size["peak_mb"].values()), "MB", count=count),
+        replace(right, better="higher"),
+    ]
 
 
 def in_own_process(count: int) -> dict[str, Any]:

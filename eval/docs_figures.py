@@ -61,13 +61,23 @@ FIGURES = {
     "a frame while the mouse drags": ("a frame while the mouse drags", ""),
     "a frame while objects glide": ("a frame while objects glide", ""),
     "file": ("file", ""),
+    "points": ("points", ""),
+    "all stages": ("processor time", ""),
+    "peak memory": ("peak memory", ""),
+    "right pairs": ("right pairs", ""),
+    "moments": ("moments", ""),
+    "right moments": ("right moments", ""),
     "time": ("time a scene", ""),
     "time a pair": ("time a pair", ""),
     "processor time": ("processor time a scene", ""),
     "processor time a pair": ("processor time a pair", ""),
 }
 SENSE = {"higher": 1.0, "lower": -1.0}
-OF_OBJECTS = re.compile(r"eval\.(?:reconstruction|segmentation)\b")  # programs that count objects, not pairs
+COUNTED = {
+    "reconstruction": "objects",
+    "segmentation": "objects",
+}  # what programs count, where it is not pairs
+NO_RIVALS = ("building", "survival")  # programs whose lines are not methods
 OURS = "ours"  # methods whose names begin so
 
 
@@ -158,19 +168,22 @@ def of_one(kept: dict[str, Any], shown: Sequence[str]) -> list[str]:
 def of_methods(kept: dict[str, Any], shown: Sequence[str], only: str = "") -> list[str]:
     """A line a method, with intervals; a column a figure. `only`: methods whose names begin so."""
     tables = {figure: rows_of(kept, figure) for figure in shown}
-    best = {f: max(map(worth, rows.values())) for f, rows in tables.items()}
+    program = re.split(r"eval\.(\w+)", kept["command"])[1]
+    rivals = program not in NO_RIVALS
+    best = {f: max(map(worth, rows.values())) if rivals else math.inf for f, rows in tables.items()}
     units = {f: next(iter(rows.values()))["unit"] for f, rows in tables.items()}
     lines = [
-        row_of(["", *(f"{f} [{unit}]" for f, unit in units.items())]),
+        row_of(["", *(f"{f} [{unit}]" if unit else f for f, unit in units.items())]),
         row_of(["---"] * (len(shown) + 1)),
     ]
     for method in dict.fromkeys(r["method"] for r in kept["rows"] if r["method"].startswith(only)):
         found = [(rows.get(method), best[f]) for f, rows in tables.items()]
         cells = [cell(r, worth(r) >= most) if r else "" for r, most in found]
         lines.append(row_of([method, *cells]))
-    facts = [f"`{kept['command']}`", kept["date"][:10], rooms_of(kept)]
-    of = "objects" if OF_OBJECTS.search(kept["command"]) else "pairs"
-    return [*lines, "", f"{', '.join(facts)}, {max(r['count'] for r in kept['rows'])} {of}."]
+    facts = [f"`{kept['command']}`", kept["date"][:10]]
+    if rivals:
+        facts += [rooms_of(kept), f"{max(r['count'] for r in kept['rows'])} {COUNTED.get(program, 'pairs')}"]
+    return [*lines, "", f"{', '.join(facts)}."]
 
 
 def rooms_of(kept: dict[str, Any]) -> str:
@@ -244,9 +257,11 @@ def cell(row: dict[str, Any], best: bool) -> str:
 
 
 def number(value: float | None) -> str:
-    """Three digits; none where more than half fail."""
+    """Three digits, of whole numbers all; none where more than half fail."""
     if value is None:
         return "none"
+    if isinstance(value, int):
+        return f"{value:,}"
     return f"{value:.1f}" if abs(value) >= 10 else f"{value:.2f}"
 
 

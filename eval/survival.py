@@ -1,10 +1,11 @@
-"""What is on disk after SIGKILL at random moments of `more2 run`, `add` and `batch`, and what going on makes of it.
+"""What is on disk after SIGKILL at random moments of five commands, and what going on makes of it.
 
 `python -m eval.survival --out runs/survival --moments 40 --seed 0`
 
-On scenes of boxes, with the smallest prior: files are under test, not the method. A moment is right if every scene on
-disk opens, and the same command (`--resume`) ends with the bytes of a run that nobody stopped and nothing beside them.
-Seconds, logs and pages, which tell the time, are left out.
+`more2 run`, `add`, `batch` and `export`, and `train.prior`: on scenes of boxes, with the smallest prior, as files are
+under test, not the method. A moment is right if every scene, export and weight file on disk opens, and the same command
+(`--resume`) ends with the bytes of a run that nobody stopped and nothing beside them. Seconds, logs and pages, which
+tell the time, and checkpoints are left out.
 """
 
 from __future__ import annotations
@@ -16,24 +17,31 @@ import signal
 import subprocess
 import sys
 import time
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import jax
 import numpy as np
+import trimesh
 import tyro
 
-from eval.harness.run_folder import write_json
+from eval.harness.results import cost, write_rows
+from eval.scores.figures import Row
 from more2_jax.config import load_config
-from more2_jax.network.prior import init_prior, save_prior
+from more2_jax.network.prior import init_prior, load_prior, save_prior
 from more2_jax.storage.ply_files import write_points
 from more2_jax.storage.scene_folder import load_scene, stored_at
 from train.run.program import run
 from train.run.settings import TrainingRun
 
-Command = Literal["run", "add", "batch"]
-TINY = Path(__file__).parents[1] / "configs" / "tiny.yaml"
+Command = Literal["run", "add", "batch", "train", "export"]
+ROOT = Path(__file__).parents[1]
+TINY = ROOT / "configs" / "tiny.yaml"
+SHAPES = ROOT / "train" / "shapes" / "open.npz"
+EXPORTED = "room.glb"
+STARTS_WITH_TWO = ("add", "export")  # scans in a living scene
 # Few steps: the command line is under test, not the method.
 FEW_STEPS = """
 matching: {method: evidence, search: {points: 32, dense: 64, cells: 8, turns: 4, steps: 2, keep: 1}}
@@ -46,6 +54,14 @@ registration:
 pose_graph: {steps: 2}
 joint: {points: 64, steps: 2}
 meshing: {coarse: 8, resolution: 16}
+"""
+FEW_TRAINING_STEPS = """
+model:
+  encoder: {widths: [8, 8, 8], code: 8, neighbors: 4, head_channels: 8, points: 32,
+            downsample_blocks: [2], downsample_factors: [2]}
+  decoder: {hidden: 32, layers: 3, skip_layer: 2, dropout: 0.1}
+training: {steps: 60, batch: 4, learning_rate: 1.0e-3, queries: 32, raw_points: 64, max_views: 2, warmup_steps: 2,
+           validate_every: 10, picture_every: 1000}
 """
 SIZES_M = np.array([[1.0, 0.5, 0.3], [0.4, 0.4, 1.2], [0.8, 0.9, 0.5]])  # of boxes
 
@@ -60,7 +76,7 @@ class Settings:
     """Processes that are killed."""
     seed: int = 0
     """Of commands and moments."""
-    commands: tuple[Command, ...] = ("run", "add", "batch")
+    commands: tuple[Command, ...] = ("run", "add", "batch", "train", "export")
     """Which."""
 
 
@@ -83,11 +99,21 @@ class Place:
         config = load_config(TINY, TrainingRun).model
         save_prior(init_prior(config, jax.random.key(0), "tiny"), self.folder / "tiny.npz")
         (self.folder / "few.yaml").write_text(FEW_STEPS, encoding="utf-8")
+        (self.folder / "train.yaml").write_text(FEW_TRAINING_STEPS, encoding="utf-8")
         rows = [f"room_{k},a.ply;{b}.ply,few.yaml,tiny.npz" for k, b in enumerate("bc")]
         (self.folder / "scenes.csv").write_text("\n".join(["name,scans,config,prior", *rows]) + "\n")
 
     def words(self, command: Command, scenes: Path) -> list[str]:
-        """The command line; it makes its scenes below `scenes`."""
+        """The command line, after Python's name; it writes below `scenes`."""
+        if command == "train":
+            settings = ["--config", str(self.folder / "train.yaml"), "--shards", str(SHAPES)]
+            return ["-m", "train.prior", *settings, "--out", str(scenes / "prior")]
+        return ["-m", "more2_jax.cli.main", *self.more2(command, scenes)]
+
+    def more2(self, command: Command, scenes: Path) -> list[str]:
+        """The words of `more2`."""
+        if command == "export":
+            return ["export", str(scenes / "room"), "--format", "glb", "--out", str(scenes / EXPORTED)]
         scans = [str(self.folder / f"{n}.ply") for n in "abc"]
         more = ["--prior", str(self.folder / "tiny.npz")]
         if command == "run":
@@ -104,20 +130,32 @@ def main(options: Annotated[Settings, tyro.conf.arg(name="")]) -> None:
     place.prepare()
     whole = {c: undisturbed(place, c) for c in dict.fromkeys(("run", *options.commands))}
     rng = np.random.default_rng(options.seed)
-    rows = []
+    told = list[dict[str, Any]]()
     for moment in range(options.moments):
         command = options.commands[moment % len(options.commands)]
         expected, seconds = whole[command]
         delay = float(rng.uniform(0, seconds))
         problem = one_moment(place, command, delay, expected)
-        rows.append({"command": command, "after_s": delay, "problem": problem})
+        told.append({"command": command, "after_s": delay, "problem": problem})
         print(f"{moment + 1}: {command} killed after {delay:.2f} s: {problem or 'right'}", flush=True)
-        write_json(options.out / "survival.json", {"seed": options.seed, "moments": rows})
+        write_rows(options.out, rows_of(told), program="survival", seed=options.seed, moments=told)
     shutil.rmtree(place.folder)
-    bad = sum(bool(r["problem"]) for r in rows)
-    print(f"{len(rows) - bad} of {len(rows)} moments right; {options.out / 'survival.json'}")
+    bad = sum(bool(t["problem"]) for t in told)
+    print(f"{len(told) - bad} of {len(told)} moments right; {options.out / 'results.json'}")
     if bad:
         sys.exit(1)
+
+
+def rows_of(told: Sequence[Mapping[str, Any]]) -> list[Row]:
+    """How many moments of each command there were, and how many of them were right."""
+    rows = []
+    for command in dict.fromkeys(t["command"] for t in told):
+        problems = [t["problem"] for t in told if t["command"] == command]
+        count = len(problems)
+        asked = cost("moments", command, count, "", count=count, scenes=0)
+        right = cost("right moments", command, problems.count(""), "", count=count, scenes=0)
+        rows += [asked, replace(right, better="higher")]
+    return rows
 
 
 def undisturbed(place: Place, command: Command) -> tuple[dict[str, bytes], float]:
@@ -127,14 +165,9 @@ def undisturbed(place: Place, command: Command) -> tuple[dict[str, bytes], float
         began = time.perf_counter()
         subprocess.run(process_words(place, command, scenes), check=True, stdout=subprocess.DEVNULL)
         seconds = time.perf_counter() - began
-    if command == "run":  # `add` begins with its first two scans
-        first_two = place.words("run", place.folder / "two")
-        words = [
-            sys.executable,
-            "-m",
-            "more2_jax.cli.main",
-            *(w for w in first_two if not w.endswith("c.ply")),
-        ]
+    if command == "run":  # others begin with its first two scans
+        first_two = process_words(place, "run", place.folder / "two")
+        words = [w for w in first_two if not w.endswith("c.ply")]
         subprocess.run(words, check=True, stdout=subprocess.DEVNULL)
     return content(scenes), seconds
 
@@ -143,7 +176,7 @@ def fresh(place: Place, command: Command, name: str) -> Path:
     """A folder as it is before the command."""
     scenes = place.folder / name
     shutil.rmtree(scenes, ignore_errors=True)
-    if command == "add":
+    if command in STARTS_WITH_TWO:
         shutil.copytree(place.folder / "two", scenes)
     else:
         scenes.mkdir()
@@ -152,7 +185,7 @@ def fresh(place: Place, command: Command, name: str) -> Path:
 
 def process_words(place: Place, command: Command, scenes: Path) -> list[str]:
     """How the command is started."""
-    return [sys.executable, "-m", "more2_jax.cli.main", *place.words(command, scenes)]
+    return [sys.executable, *place.words(command, scenes)]
 
 
 def one_moment(place: Place, command: Command, delay_s: float, expected: dict[str, bytes]) -> str:
@@ -167,9 +200,10 @@ def one_moment(place: Place, command: Command, delay_s: float, expected: dict[st
     process.communicate()
     try:
         found = [load_scene(folder)[0] for folder in scene_folders(scenes)]
+        opens(scenes)
     except ValueError as error:
         return str(error)
-    if command == "add" and not found:
+    if command in STARTS_WITH_TWO and not found:
         return "the scene is lost"
     if command != "add" or len(found[0].scans) == 2:  # the third scan is not added twice
         again = subprocess.run(words, capture_output=True, text=True)
@@ -179,6 +213,14 @@ def one_moment(place: Place, command: Command, delay_s: float, expected: dict[st
         settle(scenes / "room")
     after = content(scenes)
     return ", ".join(sorted(k for k in after.keys() | expected.keys() if after.get(k) != expected.get(k)))
+
+
+def opens(scenes: Path) -> None:
+    """Reads exports and weights. Raises ValueError where one is cut short."""
+    for path in scenes.glob("*.glb"):
+        trimesh.load_scene(path)
+    for path in scenes.glob("prior/*.npz"):
+        load_prior(path)
 
 
 def settle(folder: Path) -> None:
@@ -195,12 +237,17 @@ def scene_folders(scenes: Path) -> list[Path]:
 
 
 def content(scenes: Path) -> dict[str, bytes]:
-    """Bytes of all files of all scenes, seconds left out."""
+    """Bytes of all files of all scenes and of a training, seconds and checkpoints left out."""
     found: dict[str, bytes] = {}
     for path in sorted(p for p in scenes.rglob("*") if p.is_file()):
         name = str(path.relative_to(scenes))
+        if {"checkpoints", "tensorboard"} & set(path.relative_to(scenes).parts):
+            continue
         if path.name in ("run.log", "report.html") or path.stem == "results":
             found[name] = b""
+        elif path.name == "log.jsonl":
+            lines = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
+            found[name] = json.dumps([line | {"seconds": None} for line in lines]).encode()
         elif path.name == "scene.json":
             scene = json.loads(path.read_text(encoding="utf-8"))
             found[name] = json.dumps(scene | {"timing_s": None}).encode()

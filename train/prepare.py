@@ -14,6 +14,7 @@ from pathlib import Path
 
 from rich.progress import track
 
+from more2_jax.whole_file import whole_file
 from train.furniture.collections import SourceMesh, read_meshes
 from train.furniture.heldout import read_ikea
 from train.furniture.parallel_map import Workers
@@ -128,10 +129,9 @@ class Report:
 
     def write(self) -> None:
         """Writes atomically."""
-        partial = self.path.with_suffix(".partial")
         content = {"digest": self.digest, "rejected": self.rejected, "unreadable": self.unreadable}
-        partial.write_text(json.dumps(content, indent=1))
-        partial.replace(self.path)
+        with whole_file(self.path) as partial:
+            partial.write_text(json.dumps(content, indent=1))
 
 
 if __name__ == "__main__":

@@ -26,6 +26,7 @@ import numpy as np
 import tyro
 from rich.progress import track
 
+from more2_jax.whole_file import whole_file
 from train.furniture.closed_models import cache_name, make_cached, read_cached, read_models
 from train.furniture.collections import SourceMesh
 from train.rooms.fused_scan import ScanSettings
@@ -285,10 +286,9 @@ def write_licenses(out: Path, attribution: str | None) -> None:
 
 
 def _write(path: Path, content: Sequence[Any] | dict[str, Any]) -> None:
-    """Atomically."""
-    partial_file = path.with_suffix(".partial")
-    partial_file.write_text(json.dumps(content, indent=1), encoding="utf-8")
-    partial_file.replace(path)
+    """Whole or not at all."""
+    with whole_file(path) as partial_file:
+        partial_file.write_text(json.dumps(content, indent=1), encoding="utf-8")
 
 
 if __name__ == "__main__":

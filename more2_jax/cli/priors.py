@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -62,12 +61,7 @@ def import_published(checkpoint: Path, out: Path) -> None:
         raise ValueError(f"{out}: exists; needed a new file")
     prior = prior_from_published(read_checkpoint(checkpoint), out.stem)
     out.parent.mkdir(parents=True, exist_ok=True)
-    new = out.with_name(f".{out.stem}.new.npz")
-    try:
-        save_prior(prior, new, half=False)
-        os.replace(new, out)
-    finally:
-        new.unlink(missing_ok=True)
+    save_prior(prior, out, half=False)
     widths = dataclasses.asdict(prior.config.encoder)["widths"]
     Session().say(
         f"wrote {out}: {count(prior):,} parameters, encoder widths {list(widths)}; use it with --prior {out}"

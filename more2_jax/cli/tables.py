@@ -8,6 +8,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from more2_jax.whole_file import whole_file
+
 
 def needs_parquet(path: Path) -> tuple[Any, Any]:
     """pyarrow and its part for Parquet. Raises ValueError where it is not installed."""
@@ -29,21 +31,14 @@ def write_table(stem: Path, columns: dict[str, type], rows: Sequence[dict[str, A
     path = stem.with_suffix(".parquet")
     kinds = {str: arrow.string(), int: arrow.int64(), float: arrow.float64()}
     schema = arrow.schema([(name, kinds[kind]) for name, kind in columns.items()])
-    partial = _partial(path)
-    parquet.write_table(arrow.Table.from_pylist(rows, schema=schema), partial)
-    partial.replace(path)
+    with whole_file(path) as partial:
+        parquet.write_table(arrow.Table.from_pylist(rows, schema=schema), partial)
     return path
 
 
 def _write_csv(path: Path, columns: Sequence[str], rows: Sequence[dict[str, Any]]) -> Path:
-    partial = _partial(path)
-    with partial.open("w", newline="", encoding="utf-8") as file:
+    with whole_file(path) as partial, partial.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, columns)
         writer.writeheader()
         writer.writerows(rows)
-    partial.replace(path)
     return path
-
-
-def _partial(path: Path) -> Path:
-    return path.with_name(f".{path.name}.partial")  # of one name, so that none is left after a kill

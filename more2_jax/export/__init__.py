@@ -1,6 +1,6 @@
 """A living scene for other tools: glTF, USD, PLY, JSON, a module each; `export_scene` is the door.
 
-May import `report` (its colors), `storage`, `tracking`, `geometry`, `types`.
+May import `report` (its colors), `storage`, `tracking`, `geometry`, `types`, `whole_file`.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from more2_jax.export.poses import write_poses
 from more2_jax.export.usd import write_usd
 from more2_jax.storage.scene_folder import WRITTEN
 from more2_jax.types import LivingScene
+from more2_jax.whole_file import whole_file
 
 __all__ = ["SUFFIXES", "export_scene", "pose_in"]
 
@@ -25,7 +26,7 @@ WRITERS: dict[str, Writer] = {"glb": write_glb, "usd": write_usd, "ply": write_p
 
 
 def export_scene(scene: LivingScene, target: str | Path, format: str, *, scan: int = -1) -> Path:
-    """Writes the scene as one file and returns its path.
+    """Writes the scene as one file, whole or not at all, and returns its path.
 
     `target` is a file, or a folder, in which the file is called `export` and the format's suffix. Lengths are
     meters. Every object's mesh lies in the frame of its reference observation, so `inverse(T_ref_scan)` puts it
@@ -56,5 +57,6 @@ def export_scene(scene: LivingScene, target: str | Path, format: str, *, scan: i
     if path.name in WRITTEN and (path.parent / "scene.json").exists():
         raise ValueError(f"{path}: part of a living scene; needed another file")
     path.parent.mkdir(parents=True, exist_ok=True)
-    WRITERS[format](scene, path, scan % len(scene.scans))
+    with whole_file(path) as partial:
+        WRITERS[format](scene, partial, scan % len(scene.scans))
     return path

@@ -101,13 +101,17 @@ def observed_surface(
     lowest: float = -np.inf,
     sensors: Float[np.ndarray, "n s 3"] | None = None,
     normals: Float[np.ndarray, "n 3"] | None = None,
+    samples: int = SAMPLES,
 ) -> ObservedSurface | None:
-    """Oriented planes around observed points (scan's frame). None if there are none, or the settings ask for none."""
+    """Oriented planes around observed points (scan's frame). None if there are none, or the settings ask for none.
+
+    The field's slope, one vote of several for a plane's outer side, is asked at `samples` points at most.
+    """
     if observed is None or not config.mls_bandwidth:
         return None
     points = canonical(embedding, uniform_subsample(observed))
     eyes = None if sensors is None else canonical(embedding, uniform_subsample(sensors))
-    asked = uniform_subsample(points, SAMPLES)
+    asked = uniform_subsample(points, samples)
     slopes = _in_chunks(_field_gradients, prior, embedding, asked, GRADIENT_CHUNK)
     gradient = slopes[KDTree(asked).query(points)[1]]
     sides = None if normals is None else uniform_subsample(normals)

@@ -26,6 +26,7 @@ from more2_jax.network.decoder import Decoder, ObjectField
 from more2_jax.network.encoder import Encoder, neighbor_counts
 from more2_jax.network.two_decoders import decoder_weights, knows_normals, without_normals
 from more2_jax.types import Anchors, Embedding, PointCloud, pytree
+from more2_jax.whole_file import whole_file
 
 FORMAT = 1  # of weight files
 
@@ -228,12 +229,13 @@ def sdf(
 
 
 def save_prior(prior: Prior, path: str | Path, half: bool = True) -> None:
-    """Writes weights and settings as one .npz (half precision unless `half` is False)."""
+    """Writes weights and settings as one .npz (half precision unless `half` is False), whole or not at all."""
     flat = flatten_dict(jax.device_get(prior.params), sep="/")
     kind = np.float16 if half else np.float32
     header = json.dumps({"format": FORMAT, "name": prior.name, "config": dataclasses.asdict(prior.config)})
     arrays: dict[str, Any] = {k: np.asarray(v, kind) for k, v in flat.items()}
-    np.savez_compressed(path, __header__=np.array(header), **arrays)
+    with whole_file(path) as partial, partial.open("wb") as file:
+        np.savez_compressed(file, __header__=np.array(header), **arrays)
 
 
 def load_prior(name: str | Path) -> Prior:

@@ -17,7 +17,7 @@ from more2_jax.geometry.observations import seen_from, with_poses
 from more2_jax.geometry.outliers import inliers
 from more2_jax.geometry.padding import bucket
 from more2_jax.geometry.poses import Pose
-from more2_jax.meshing.extract import lowest_height, observed_surface
+from more2_jax.meshing.extract import GRADIENT_CHUNK, lowest_height, observed_surface
 from more2_jax.meshing.object_mesh import object_floor
 from more2_jax.meshing.observed_surface import ObservedSurface, uniform_subsample
 from more2_jax.network.embedding_batch import SMALLEST_BATCH, embed
@@ -30,6 +30,7 @@ from more2_jax.types import AccumulatedObject
 # a mesh costs" in docs/developing/notebook/speed_scene.md), and of these the ones that are compared with the other
 # observations'.
 SURFACE_POINTS, COMPARED_POINTS = 8192, 1024
+SLOPES_ASKED = GRADIENT_CHUNK  # points: one call of the prior on CPUs
 MAX_OBSERVATIONS = 32  # of an object: its first, and the last of the others; more stay as registered
 MIN_OBSERVATIONS = 4  # of the padded batch: objects seen two to four times share one compiled program
 OBJECTS_A_CALL = (
@@ -93,7 +94,9 @@ def observation_surfaces(
         own = own[inliers(o.points[own], config.meshing.outlier_factor)]
         eyes = None if sensors is None else sensors[own]
         sides = None if o.normals is None else o.normals[own]
-        yield observed_surface(prior, o.embedding, o.points[own], config.meshing, lowest, eyes, sides)
+        yield observed_surface(
+            prior, o.embedding, o.points[own], config.meshing, lowest, eyes, sides, SLOPES_ASKED
+        )
 
 
 def max_turn_deg(surfaces: Sequence[ObservedSurface | None]) -> float:

@@ -1,6 +1,6 @@
 """The page a person looks at: one HTML file that needs nothing else; `report_html` makes it, `page` puts it together.
 
-May import `tracking`, `geometry`, `config`, `progress`, `types`.
+May import `tracking`, `geometry`, `config`, `progress`, `types`, `whole_file`.
 """
 
 from more2_jax.report.page import report_html, write_report

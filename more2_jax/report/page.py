@@ -21,6 +21,7 @@ from more2_jax.report.lists import (
 from more2_jax.report.payload import payload
 from more2_jax.report.wording import leveled_text
 from more2_jax.types import LivingScene
+from more2_jax.whole_file import whole_file
 
 # In the order in which they need each other; all share one scope.
 PROGRAM = ("data", "room", "trails", "pace", "stage", "labels", "panel", "controls", "main")
@@ -37,7 +38,8 @@ TOGGLES = (  # name, what it says, on at first
 
 def write_report(scene: LivingScene, path: str | Path, config: SceneConfig) -> None:
     """Writes the scene's page, `report_html`, as UTF-8."""
-    Path(path).write_text(report_html(scene, config), encoding="utf-8")
+    with whole_file(path) as partial:
+        partial.write_text(report_html(scene, config), encoding="utf-8")
 
 
 def report_html(scene: LivingScene, config: SceneConfig) -> str:

@@ -7,7 +7,6 @@ at a time, and keeps the best.
 from __future__ import annotations
 
 import dataclasses
-import os
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +16,7 @@ from jaxtyping import Float
 
 from more2_jax.storage.scene_folder import DAMAGE, load_scene
 from more2_jax.types import LivingScene, SceneObject
+from more2_jax.whole_file import whole_file
 
 VERSION = 1
 SIZE_WEIGHT = 0.5  # of |log| of the ratio of the F_s, as `EvidenceMatcher.size_weight`
@@ -121,10 +121,8 @@ def index_folders(folders: Iterable[Path]) -> SceneIndex:
 
 def save_index(index: SceneIndex, path: Path) -> None:
     """Writes it, whole or not at all."""
-    partial = path.with_name(f".{path.name}.new")
-    with partial.open("wb") as file:
+    with whole_file(path) as partial, partial.open("wb") as file:
         np.savez_compressed(file, version=np.array(VERSION), **vars(index))
-    os.replace(partial, path)
 
 
 def load_index(path: Path) -> SceneIndex:

@@ -16,11 +16,14 @@ pytestmark = pytest.mark.skipif(os.name != "posix", reason="sends signals")
 @pytest.mark.slow
 def test_a_few_moments_of_run_and_add(tmp_path, capsys):
     survival.main(survival.Settings(out=tmp_path, moments=2, seed=1, commands=("run", "add")))
-    told = json.loads((tmp_path / "survival.json").read_text())
-    assert [(m["command"], m["problem"]) for m in told["moments"]] == [("run", ""), ("add", "")]
-    assert all(m["after_s"] > 0 for m in told["moments"])
+    told = json.loads((tmp_path / "results.json").read_text())
+    moments = told["settings"]["moments"]
+    assert [(m["command"], m["problem"]) for m in moments] == [("run", ""), ("add", "")]
+    assert all(m["after_s"] > 0 for m in moments)
+    found = {(r["name"], r["method"]): r["value"] for r in told["rows"]}
+    assert found == {(name, c): 1 for c in ("run", "add") for name in ("moments", "right moments")}
     assert "2 of 2 moments right" in capsys.readouterr().out
-    assert [p.name for p in tmp_path.iterdir()] == ["survival.json"]
+    assert [p.name for p in tmp_path.iterdir()] == ["results.json"]
 
 
 def test_what_is_compared_is_every_byte_but_of_what_tells_the_time(tmp_path):

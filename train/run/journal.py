@@ -13,6 +13,8 @@ import numpy as np
 from jaxtyping import UInt8
 from PIL import Image
 
+from more2_jax.whole_file import whole_file
+
 
 class Journal:
     """The log of one run in one folder; a context manager. Of all processes one keeps it.
@@ -24,9 +26,8 @@ class Journal:
     def __init__(self, out: Path, step: int) -> None:
         self.path, self.pictures = out / "log.jsonl", out / "pictures"
         self.lines = [line for line in read_log(self.path) if line["step"] <= step]
-        partial = self.path.with_suffix(".partial")
-        partial.write_text("".join(json.dumps(line) + "\n" for line in self.lines))
-        partial.replace(self.path)
+        with whole_file(self.path) as partial:
+            partial.write_text("".join(json.dumps(line) + "\n" for line in self.lines))
         self.curves = _curves(out / "tensorboard", step)
 
     def __enter__(self) -> Self:

@@ -9,6 +9,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
 from more2_jax.config import DecoderConfig, PriorConfig
 from more2_jax.network.prior import Prior, encode_ordered, init_prior, load_prior, points_read
@@ -16,6 +17,7 @@ from more2_jax.network.two_decoders import with_rows_for_normals, without_normal
 from train.run.settings import TrainingConfig, TrainingRun
 from train.run.shape_mix import ShapeMix
 from train.shards.sampling import sample_batch
+from train.shards.shards import Shapes
 
 CALIBRATED = 32  # training shapes, by which the encoder's output constant is chosen
 
@@ -86,7 +88,11 @@ def calibrated(model: PriorConfig, training: TrainingConfig, train: ShapeMix) ->
     shapes = train.read(np.linspace(0, len(train) - 1, min(CALIBRATED, len(train))).astype(int))
     index = jnp.arange(len(shapes.views))
     shapes = jax.tree.map(jnp.asarray, shapes)
-    sample = sample_batch(jax.random.key(training.seed), shapes, index, training, points_read(model))
-    scale = jax.jit(jax.vmap(partial(encode_ordered, prior)))(sample.points[:, 0], sample.mask[:, 0]).scale
-    constant = float(f"{1 / float(scale.mean()):.3g}")
+
+    @jax.jit
+    def mean_scale(key: jax.Array, shapes: Shapes) -> Float[jax.Array, ""]:
+        sample = sample_batch(key, shapes, index, training, points_read(model))
+        return jax.vmap(partial(encode_ordered, prior))(sample.points[:, 0], sample.mask[:, 0]).scale.mean()
+
+    constant = float(f"{1 / float(mean_scale(jax.random.key(training.seed), shapes)):.3g}")
     return dataclasses.replace(model, encoder=dataclasses.replace(model.encoder, output_scale=constant))

@@ -18,6 +18,7 @@ import numpy as np
 import point_cloud_utils as pcu
 import trimesh
 
+from more2_jax.whole_file import whole_file
 from train.furniture.near_duplicates import THRESHOLD, Twin, twins_across_splits
 from train.run.program import run
 from train.shards.shards import EXCLUDED, read_meta, read_solids, shard_folders
@@ -67,9 +68,8 @@ def main(shards: tuple[Path, ...], out: Path | None = None, threshold: float = T
 def write_excluded(folder: Path, twins: Sequence[Twin], threshold: float) -> None:
     """Names what no split of the folder may use; atomically."""
     content = {"threshold": threshold, "names": [t.name for t in twins], "twins": [asdict(t) for t in twins]}
-    partial = folder / f"{EXCLUDED}.partial"
-    partial.write_text(json.dumps(content, indent=1))
-    partial.replace(folder / EXCLUDED)
+    with whole_file(folder / EXCLUDED) as partial:
+        partial.write_text(json.dumps(content, indent=1))
 
 
 def check_shapes(shards: Iterable[Path], meta: Sequence[dict[str, Any]], points: int = 500) -> Checks:
