@@ -32,6 +32,7 @@ IMAGE_MARGIN = 1.2  # half the width of a view, in that of the object's image
 PIXEL_SPACINGS = (
     2.5  # a pixel is so many times the median angle between neighboring points, so that few are empty
 )
+SPACINGS = 2_000  # points, at most, whose nearest neighbor is looked for
 MIN_DEPTH_M = 0.05  # sensors see nothing nearer
 MARGIN_M, MARGIN_PER_M2 = (
     0.02,
@@ -78,7 +79,7 @@ def view_of(cloud: Points, room: Points | Around, eye: Float[np.ndarray, "3"]) -
         return None
     image = own[:, :2] / own[:, 2:]
     half = IMAGE_MARGIN * float(np.abs(image).max()) + 1e-6
-    spacing = float(np.median(KDTree(image).query(image, k=2)[0][:, 1])) if len(image) > 1 else half
+    spacing = median_spacing(image) if len(image) > 1 else half
     side = int(np.clip(2 * half / (PIXEL_SPACINGS * spacing + 1e-9), MIN_PIXELS, PIXELS))
     if isinstance(room, Around):
         room = room.scan.in_view(room.cells, eye, turn[2], half)
@@ -94,6 +95,15 @@ def view_of(cloud: Points, room: Points | Around, eye: Float[np.ndarray, "3"]) -
     return Sight(
         eye=np.asarray(eye, np.float64), turn=turn, half=np.asarray(half), side=np.asarray(side), clear=clear
     )
+
+
+def median_spacing(points: Float[np.ndarray, "n d"]) -> float:
+    """Of points to the nearest other one; asked at `SPACINGS` of them at most."""
+    tree = KDTree(
+        points, compact_nodes=False, balanced_tree=False
+    )  # made in a third of the time for few questions
+    asked = points[:: -(-len(points) // SPACINGS)]
+    return float(np.median(tree.query(asked, k=2)[0][:, 1]))
 
 
 def margin(depth: Float[np.ndarray, "*_"] | float) -> Float[np.ndarray, "*_"] | float:
