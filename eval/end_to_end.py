@@ -17,7 +17,7 @@ import jax
 import tyro
 
 from eval.data.truth import KnownScene
-from eval.harness.options import OptionsBeside, benchmark, is_upright
+from eval.harness.options import OptionsBeside, benchmark, is_upright, told_upright
 from eval.harness.program import Program, Summary, carry_out, run_program
 from eval.harness.runs import Run, Work, open_run
 from eval.peers.end_to_end import NAME, combined, without_learning
@@ -77,14 +77,15 @@ def main(options: Annotated[Settings, tyro.conf.arg(name="")]) -> None:
 
 def prepare(options: Settings) -> tuple[Run, Work]:
     """The run, and what is done with its scenes."""
-    upright = is_upright(options, benchmark(options))
+    data = benchmark(options)
+    upright = is_upright(options, data)
     peers = {NAME: without_learning(upright)} if options.peers else {}
     peers |= learned_stages(options.learned, upright)
     facts = {"methods": [*(f"ours, {p}" for p in options.presets), *peers], "samples": options.samples}
     current = open_run("end_to_end", options, {**facts, **stated(options.learned)})
     methods: dict[str, Callable[[KnownScene], list[Track]]] = {}
     for name in options.presets:
-        config = preset(name, upright=upright)
+        config = preset(name, upright=told_upright(options, data))
         methods[f"ours, {name}"] = lambda s, c=config: tracks_of(living_scene(s, current.prior, c))
     for name, stages in peers.items():
         methods[name] = lambda s, p=stages: combined(s.scans, p)

@@ -26,18 +26,19 @@ from more2_jax.tracking.changes import changes_between, forgotten, not_seen_in
 from more2_jax.tracking.comparison import Comparison
 from more2_jax.tracking.identify import Found, Identified, identify, with_left_over
 from more2_jax.tracking.joined_masks import join_parts
-from more2_jax.tracking.leveling import as_given, level_of, leveled, shows_floor
+from more2_jax.tracking.leveling import (
+    as_given,
+    level_by_objects,
+    level_of,
+    leveled,
+    shows_floor,
+    tells_up,
+)
 from more2_jax.tracking.looked_at import not_looked_at
 from more2_jax.tracking.mask_borders import mend_borders
 from more2_jax.tracking.merged_masks import divide_merged
 from more2_jax.tracking.object_views import few_sensors, instance_sights, object_sights
-from more2_jax.tracking.objects import (
-    SCENE_FRAME,
-    accumulated,
-    new_objects,
-    next_number,
-    seen_again,
-)
+from more2_jax.tracking.objects import SCENE_FRAME, accumulated, new_objects, next_number, seen_again
 from more2_jax.tracking.regrouped import Regrouped
 from more2_jax.tracking.relocalize import known_object, relocalize
 from more2_jax.tracking.room_points import Cleared, without_room
@@ -131,10 +132,29 @@ def add_scan(
     """Adds a scan: matches its instances to the scene's objects, registers the pairs, and notes what changed.
 
     An object that was absent from earlier scans can come back. Meshes of objects that were seen again are dropped,
-    and `reconstruct` makes new ones. Raises ValueError if the scan has no usable instance.
+    and `reconstruct` makes new ones. Where objects are upright because the first scan has a floor, and this one has
+    none, they are found in any orientation first, which tells where up is in this scan; then anew, upright. Raises
+    ValueError if the scan has no usable instance.
     """
-    config, scene = settled(config, scene.upright), readable(prior, scene)
-    level, T_level_scan = leveled_scan(scan, config, scene.scans[0])
+    scene, T_level_scan = readable(prior, scene), None
+    if config.upright is None and scene.upright and not tells_up(remembered(scan.background)):
+        found = added(prior, scene, scan, settled(config, False), progress)
+        T_level_scan = level_by_objects(found, scan)
+        if T_level_scan is None:
+            return found
+    return added(prior, scene, scan, settled(config, scene.upright), progress, T_level_scan)
+
+
+def added(
+    prior: Prior,
+    scene: LivingScene,
+    scan: Scan,
+    config: SceneConfig,
+    progress: Watcher | None,
+    T_level_scan: Pose | None = None,
+) -> LivingScene:
+    """`add_scan` with `upright` settled. `T_level_scan` levels the scan, where it is known."""
+    level, T_level_scan = leveled_scan(scan, config, scene.scans[0], T_level_scan)
     masks, skipped = usable(level, config)
     cleared = without_floor_and_walls(masks, level, config)
     index, timing = len(scene.scans), dict(scene.timing_s)
@@ -325,12 +345,18 @@ def settled(config: SceneConfig, upright: bool) -> SceneConfig:
     return dataclasses.replace(config, upright=upright) if config.upright is None else config
 
 
-def leveled_scan(scan: Scan, config: SceneConfig, first: ScanRecord | None = None) -> tuple[Scan, Pose]:
-    """Returns the scan, leveled if the scene is upright, and T_level_scan. `first`: the scene's first scan."""
+def leveled_scan(
+    scan: Scan, config: SceneConfig, first: ScanRecord | None = None, T_level_scan: Pose | None = None
+) -> tuple[Scan, Pose]:
+    """Returns the scan, leveled if the scene is upright, and T_level_scan, by its floor if it is not known.
+
+    `first`: the scene's first scan.
+    """
     if not config.upright:
         return scan, np.eye(4)
-    T_level_first = None if first is None else first.frame.T_scene_scan
-    T_level_scan = level_of(remembered(scan.background), T_level_first)
+    if T_level_scan is None:
+        T_level_first = None if first is None else first.frame.T_scene_scan
+        T_level_scan = level_of(remembered(scan.background), T_level_first)
     return leveled(scan, T_level_scan), T_level_scan
 
 

@@ -36,8 +36,11 @@ class Options:
     """How many scans of each scene, from the first; 0 for all."""
     masks: Masks = "true"
     """true, damaged on purpose, or (3rscan) predicted: mask3d.labels.npz beside each scan."""
-    upright: Literal["auto", "yes", "no"] = "auto"
-    """Whether the method is told that objects only turn about the vertical; auto: as the data were made."""
+    upright: Literal["auto", "yes", "no", "found"] = "auto"
+    """Whether the method is told that objects only turn about the vertical; auto: as the data were made; found (of
+    whole scenes): it is told nothing, as `more2 run`, and peers as the data were made."""
+    rooms: Literal["all", "first", "none"] = "all"
+    """Which scans keep what is no object: floor, walls, clutter."""
     sensors: bool = True
     """Whether the method is told where the sensors of every scan stood, where the data say so. Peers never ask."""
     peers: bool = True
@@ -94,7 +97,17 @@ def benchmark(o: Options) -> Benchmark:
         if o.dataset == "3rscan"
         else flyingshape(o.data)
     )
-    return data if o.sensors else replace(data, read=lambda name: without_sensors(data.read(name)))
+    if o.sensors and o.rooms == "all":
+        return data
+    return replace(data, read=lambda name: less_told(data.read(name), o))
+
+
+def less_told(scene: KnownScene, o: Options) -> KnownScene:
+    """The scene without what the options withhold."""
+    scene = scene if o.sensors else without_sensors(scene)
+    kept = {"all": len(scene.scans), "first": 1, "none": 0}[o.rooms]
+    bare = [replace(s, background=np.zeros((0, 3))) for s in scene.scans[kept:]]
+    return replace(scene, scans=(*scene.scans[:kept], *bare))
 
 
 def without_sensors(scene: KnownScene) -> KnownScene:
@@ -103,5 +116,10 @@ def without_sensors(scene: KnownScene) -> KnownScene:
 
 
 def is_upright(o: Options, data: Benchmark) -> bool:
-    """What the method is told."""
-    return data.upright if o.upright == "auto" else o.upright == "yes"
+    """Whether objects are taken to turn about the vertical only, where nobody looks for it."""
+    return data.upright if o.upright in ("auto", "found") else o.upright == "yes"
+
+
+def told_upright(o: Options, data: Benchmark) -> bool | None:
+    """What the method is told; None: nothing."""
+    return None if o.upright == "found" else is_upright(o, data)

@@ -29,7 +29,7 @@ from eval.data.flyingshape import digest
 from eval.data.masks import DAMAGES, with_masks
 from eval.data.truth import Benchmark, KnownScene
 from eval.harness.extra import library
-from eval.harness.options import Options, benchmark, is_upright
+from eval.harness.options import Options, benchmark, told_upright
 from eval.harness.run_folder import RunFolder, claim, write_json
 from eval.harness.shards import shard_of
 from eval.scores.figures import Record
@@ -38,6 +38,7 @@ from more2_jax.network.prior import Prior, load_prior
 
 VERSION = 1
 PEER_LIBRARIES = ("open3d", "small_gicp")  # that peers of all programs are made of
+WHOLE_SCENES = "end_to_end"  # the program that looks for the vertical, if asked
 Work = Callable[[Sequence[KnownScene]], Sequence[list[Record]]]  # records of every scene of a chunk
 
 
@@ -64,14 +65,16 @@ def start_run(program: str, o: Options, settings: dict[str, Any]) -> Run:
 def open_run(program: str, o: Options, settings: dict[str, Any]) -> Run:
     """Data, weights and settings of a run; its folder is not touched.
 
-    Raises ValueError if there are no such data or weights, and if peers are asked for whose libraries cannot be
-    imported.
+    Raises ValueError if there are no such data or weights, if peers are asked for whose libraries cannot be imported,
+    and if the vertical is to be found where no whole scenes are made.
     """
+    if o.upright == "found" and program != WHOLE_SCENES:
+        raise ValueError(f"{program}: upright found; needed auto, yes or no, as it makes no whole scenes")
     if o.peers:  # a peer that cannot run would count as one that fails on every scene
         for name in PEER_LIBRARIES:
             library(name)
     data, prior = benchmark(o), load_prior(o.prior)
-    config = preset(o.preset, upright=is_upright(o, data))
+    config = preset(o.preset, upright=told_upright(o, data))
     stated = {
         "version": VERSION,
         "program": program,
@@ -81,6 +84,7 @@ def open_run(program: str, o: Options, settings: dict[str, Any]) -> Run:
         "preset": o.preset,
         "config": dataclasses.asdict(config),
         "masks": o.masks,
+        "rooms": o.rooms,
         "visits": o.visits,
         **settings,
     }

@@ -10,12 +10,14 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from more2_jax.geometry.gravity import gravity, least_turn, stand_on_floor
+from more2_jax.geometry.gravity import Gravity, gravity, least_turn, stand_on_floor
 from more2_jax.geometry.poses import Points, Pose, apply_pose, turned
 from more2_jax.geometry.up_axis import likely_up_axis
-from more2_jax.types import Frame, Instance, Observation, Scan, SceneObject
+from more2_jax.types import Frame, Instance, LivingScene, Observation, Scan, SceneObject
 
 LEAST_TILT_DEG = 0.5  # a smaller tilt is left alone: clean scans stay as they are
+# Of objects whose up tells that of a scan without floors, and the tilt that they tell for sure.
+LEAST_AGREEING, AGREE_DEG, SURE_TILT_DEG = 2, 5.0, 2.0
 
 
 def shows_floor(scan: Scan) -> bool:
@@ -46,6 +48,31 @@ def level_of(background: Points, T_level_first: Pose | None = None) -> Pose:
     if left.tilt_deg < LEAST_TILT_DEG:
         return T_level_first
     return np.eye(4) if found.tilt_deg < LEAST_TILT_DEG else found.level(np.median(background, axis=0))
+
+
+def tells_up(background: Points) -> bool:
+    """Whether a scan's floors, or its ceiling, tell where up is."""
+    return gravity(background) is not None
+
+
+def level_by_objects(scene: LivingScene, scan: Scan) -> Pose | None:
+    """T_level_scan of a scene's last scan, by the objects that were found in it in any orientation.
+
+    Each has an up of its own there: that of its reference observation. None unless half of them, and
+    `LEAST_AGREEING`, agree within `AGREE_DEG`. That of the first scan, where it levels this one too.
+    """
+    seen = [o.observations[-1] for o in scene.objects if o.reference_scan != len(scene.scans) - 1]
+    ups = np.array([s.T_ref_scan[2, :3] for s in seen if s.scan == len(scene.scans) - 1]).reshape(-1, 3)
+    agree = ups @ ups.T > np.cos(np.deg2rad(AGREE_DEG))
+    count = agree.sum(axis=1)
+    if not len(ups) or count.max() < max(LEAST_AGREEING, len(ups) / 2):
+        return None
+    up = ups[agree[count.argmax()]].mean(axis=0)
+    found = Gravity(up=up / np.linalg.norm(up), share=0.0)
+    T_level_first = scene.scans[0].frame.T_scene_scan
+    if dataclasses.replace(found, up=T_level_first[:3, :3] @ found.up).tilt_deg < SURE_TILT_DEG:
+        return T_level_first
+    return found.level(np.median(np.concatenate([i.points for i in scan.instances]), axis=0))
 
 
 def is_level(T_level_scan: Pose) -> bool:

@@ -13,17 +13,18 @@ from places import ROOT
 from published_folder import write_published
 
 from eval import everything, report
+from eval.data.truth import KnownScene
 from eval.harness.batched import PairToRegister, embed_all, register_all
-from eval.harness.options import Options
+from eval.harness.options import Options, less_told
 from eval.harness.plots import draw_ecdf, draw_over_scans
 from eval.harness.results import finish
-from eval.harness.runs import run_scenes, start_run
+from eval.harness.runs import open_run, run_scenes, start_run
 from eval.matching import match_own
 from eval.scores.figures import Figure
 from more2_jax.config import DescentRegistration, SceneConfig, preset
 from more2_jax.network.embedding_batch import embed
 from more2_jax.network.prior import save_prior
-from more2_jax.types import ObservedObject
+from more2_jax.types import ObservedObject, Scan
 
 
 @pytest.fixture
@@ -73,6 +74,24 @@ def test_other_settings_need_another_folder(options):
         start_run("test", other, {})
     fresh = start_run("test", dataclasses.replace(other, fresh=True), {})
     assert fresh.records() == {}
+
+
+def test_the_vertical_is_found_by_whole_scenes_alone(options):
+    found = dataclasses.replace(options, upright="found")
+    assert open_run("end_to_end", found, {}).config.upright is None
+    assert open_run("end_to_end", options, {}).config.upright is False  # as these data were made
+    with pytest.raises(ValueError, match="matching: upright found; needed auto, yes or no"):
+        open_run("matching", found, {})
+
+
+def test_rooms_are_withheld_scan_by_scan(options):
+    scans = [Scan(name=n, source=n, instances=(), background=np.ones((4, 3))) for n in "abc"]
+    scene = KnownScene(name="s", scans=tuple(scans), objects=())
+    kept = {
+        rooms: [len(s.background) for s in less_told(scene, dataclasses.replace(options, rooms=rooms)).scans]
+        for rooms in ("all", "first", "none")
+    }
+    assert kept == {"all": [4, 4, 4], "first": [4, 0, 0], "none": [0, 0, 0]}
 
 
 def test_results_name_command_data_and_hardware(options):

@@ -21,7 +21,7 @@ from more2_jax.registration.pose_costs import off_fields
 from more2_jax.registration.register_pairs import register
 
 POINTS = 512  # of every cloud
-PIECES = 4
+PIECES = 3
 # Fewer points and starts than the preset: the clouds are clean and whole.
 FIELD = FieldRegistration(turns=4, search_points=32, search_steps=4, keep=2, points=128, steps=8)
 # What a completed surface misses its own points by, and so a pose laid by it: the field is learned, not measured.

@@ -6,7 +6,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from factories import turn_z
+from factories import living_scene, scene_object, turn_z
 from scipy.spatial.transform import Rotation
 from small_scenes import CONFIG, in_frame, room, scan
 
@@ -17,7 +17,14 @@ from more2_jax.meshing.object_mesh import object_floor
 from more2_jax.scene import add_scan, leveled_scan, start_scene
 from more2_jax.tracking import leveling
 from more2_jax.tracking.accumulated import accumulated_object
-from more2_jax.tracking.leveling import LEAST_TILT_DEG, as_given, level_of, leveled, shows_floor
+from more2_jax.tracking.leveling import (
+    LEAST_TILT_DEG,
+    as_given,
+    level_by_objects,
+    level_of,
+    leveled,
+    shows_floor,
+)
 from more2_jax.tracking.objects import place_of, points_of
 from more2_jax.tracking.relocalize import known_object
 from more2_jax.types import Frame, LivingScene, Scan
@@ -83,6 +90,11 @@ def said(scene: LivingScene) -> list:
 def assert_same_but_for(T_first: np.ndarray, T_second: np.ndarray, found: LivingScene, level: LivingScene):
     """The same matches and changes; poses differ by the motions of the scans, to 0.2° and 1 cm."""
     assert said(found) == said(level)
+    assert_poses_but_for(T_first, T_second, found, level)
+
+
+def assert_poses_but_for(T_first: np.ndarray, T_second: np.ndarray, found: LivingScene, level: LivingScene):
+    """Poses differ by the motions of the scans."""
     for T, expected in zip(relative(found), relative(level), strict=True):
         T = np.linalg.inv(T_first) @ T @ T_second
         np.testing.assert_allclose(T[:3, :3], expected[:3, :3], atol=np.deg2rad(0.2))
@@ -221,3 +233,76 @@ def test_a_scan_on_its_side_shows_no_floor(up):
     T[:3, :3] = R_UP[up].T
     lying = in_frame(A, T)
     assert not shows_floor(lying)
+
+
+# --- a later scan without a floor -----------------------------------------------------------------------------
+
+
+def bare(s: Scan) -> Scan:
+    """Objects alone."""
+    return dataclasses.replace(s, background=NOTHING)
+
+
+@pytest.mark.parametrize("tilt_deg", [0.0, 12.0])
+def test_a_later_scan_without_a_floor_is_leveled_by_its_objects(tiny_prior, level_scene, tilt_deg):
+    T = tilt(B, tilt_deg, 160.0)
+    scene = start_scene(tiny_prior, A, OPEN)
+    found = add_scan(tiny_prior, scene, in_frame(bare(B), T), OPEN)
+    assert said(found)[1:] == said(level_scene)[1:]
+    assert tilt_deg or said(found) == said(level_scene)  # what stayed is known only in a common frame
+    assert_poses_but_for(SAME, T, found, level_scene)
+    assert found.scans[1].frame.tilt_deg == pytest.approx(tilt_deg, abs=0.5)
+    ups = [(a @ T)[:3, 2] for a in relative(found)]  # upright things stay so
+    np.testing.assert_allclose(ups, [[0, 0, 1]] * 3, atol=np.deg2rad(0.5))
+
+
+def found_with(ups: list[np.ndarray], T_level_first: np.ndarray = SAME) -> LivingScene:
+    """A scene whose second scan shows objects with these directions up in it, and one that is new."""
+    rotations = [Rotation.align_vectors([[0, 0, 1]], [up])[0].as_matrix() for up in ups]
+    poses = [np.block([[R, np.ones((3, 1))], [np.zeros((1, 3)), 1.0]]) for R in rotations]
+    objects = [scene_object(k, {0: SAME, 1: T}) for k, T in enumerate(poses)]
+    first, second, _ = living_scene().scans
+    first = dataclasses.replace(first, frame=Frame(T_scene_scan=T_level_first))
+    return dataclasses.replace(
+        living_scene(), objects=(*objects, scene_object(9, {1: SAME})), scans=(first, second)
+    )
+
+
+def way_up(tilt_deg: float, about_deg: float = 0.0) -> np.ndarray:
+    """A direction so far off z."""
+    return np.linalg.inv(tilt(A, tilt_deg, about_deg))[2, :3]
+
+
+def test_up_is_where_most_objects_have_theirs():
+    scene = found_with([way_up(10.0), way_up(11.0), way_up(9.0), way_up(90.0, 45.0)])
+    T = level_by_objects(scene, B)
+    assert T is not None
+    np.testing.assert_allclose(T[:3, :3] @ way_up(10.0), [0, 0, 1], atol=np.deg2rad(0.1))
+    middle = np.median(np.concatenate([i.points for i in B.instances]), axis=0)
+    np.testing.assert_allclose(apply_pose(T, middle[None])[0], middle, atol=1e-9)
+
+
+def test_what_few_objects_say_or_many_deny_is_not_believed():
+    for ups in (
+        [],
+        [way_up(10.0)],
+        [way_up(10.0), way_up(40.0)],
+        [way_up(0.0)] * 2 + [way_up(30.0, k) for k in (0, 90, 180)],
+    ):
+        assert level_by_objects(found_with(ups), B) is None
+
+
+def test_a_frame_that_is_shared_as_far_as_objects_tell_stays_shared():
+    first = tilt(A, 7.0, 30.0)
+    up = np.linalg.inv(first)[:3, 2]
+    assert level_by_objects(found_with([up, up], first), B) is first
+
+
+def test_where_objects_do_not_agree_they_stay_as_they_were_found(tiny_prior, monkeypatch):
+    scene = start_scene(tiny_prior, A, OPEN)
+    monkeypatch.setattr("more2_jax.scene.level_by_objects", lambda *_: None)
+    found = add_scan(tiny_prior, scene, bare(B), OPEN)
+    free = add_scan(tiny_prior, scene, bare(B), dataclasses.replace(CONFIG, upright=False))
+    assert said(found) == said(free)
+    for one, other in zip(relative(found), relative(free), strict=True):
+        np.testing.assert_array_equal(one, other)
