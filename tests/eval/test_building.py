@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from eval.building import PITCH_M, Watch, building, filled, spiral
+from eval.building import PITCH_M, Watch, building, filled, rows_of, spiral
 from more2_jax.progress import Progress
 from more2_jax.types import Instance, Scan
 from train.rooms.visits import FlyingScene, TrueObject
@@ -68,6 +68,24 @@ def test_an_object_is_filled_up_near_its_own_points():
 def test_no_rooms_are_refused():
     with pytest.raises(ValueError, match="0 rooms without objects"):
         building([], 3)
+
+
+def test_a_size_is_told_by_its_sums_its_peak_and_its_share_of_right_pairs():
+    size = {
+        "objects": 8,
+        "points": 900,
+        "cpu_seconds": {"match": 2.0, "rest": 0.5},
+        "peak_mb": {"match": 700.0, "rest": 650.0},
+        "right": 6,
+        "true": 8,
+    }
+    found = {r.name: (r.method, r.value, r.better) for r in rows_of(size)}
+    assert found == {
+        "points": ("8 objects", 900, "lower"),
+        "processor time": ("8 objects", 2.5, "lower"),
+        "peak memory": ("8 objects", 700.0, "lower"),
+        "right pairs": ("8 objects", 75.0, "higher"),
+    }
 
 
 def test_a_peak_is_that_of_its_own_stage():

@@ -91,6 +91,17 @@ def test_a_single_method_has_no_best_and_a_table_says_what_it_counts(docs):
     assert "2026-11-25, 1 room, 8 objects." in many
 
 
+def test_lines_that_are_no_rivals_have_no_best_and_whole_numbers_all_digits(docs):
+    kinds = [row("points", "", f"{n} objects", 1_000 * n) | {"unit": "", "ci95": None} for n in (8, 1_600)]
+    results = RESULTS | {"command": "python -m eval.building --data rooms", "rows": kinds}
+    (docs / "runs" / "a" / "results.json").write_text(json.dumps(results), encoding="utf-8")
+    main(docs / "runs" / "a", "a", docs)
+    made = with_tables(ONE.replace("MR, median RE", "points; lines = methods"), docs / "figures")
+    assert "|  | points |\n" in made
+    assert "| 8 objects | 8,000 |\n| 1600 objects | 1,600,000 |\n" in made
+    assert "`python -m eval.building --data rooms`, 2026-11-25.\n" in made
+
+
 def test_ours_is_the_preset_of_the_run_whatever_its_variants_reach(docs):
     """The first method; the best of its variants would be chosen with the result in view."""
     better = row("MR", "strict", "ours, robust, otherwise", 99.0)
