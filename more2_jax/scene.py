@@ -60,6 +60,7 @@ from more2_jax.types import (
 
 # Regrouped masks, objects and instances as matching compared them, and the matches.
 Compared = tuple[Regrouped, list[tuple[ObservedObject, Pose]], list[ObservedObject], Identified]
+Mend = Callable[[Regrouped, Comparison], Regrouped | None]
 
 CLOSED_AT_ONCE = 64  # objects whose poses are refined in one call; each takes a MB
 BACKGROUND_POINTS = 20_000  # of a scan, kept for the page and for free space
@@ -114,16 +115,20 @@ def who_is_who(
         old, new = compared_objects(known, masks.instances, masks.embeddings, scan, config)
         return masks, old, new, identify(prior, [o for o, _ in old], new, config, rooms)
 
+    def mended_by(mend: Mend, known: Compared) -> Regrouped | None:
+        masks, old, new, identified = known
+        compared = Comparison.of(prior, [o for o, _ in old], new, identified, config)
+        return compared and mend(masks, compared)
+
     regroup = join_parts, partial(divide_merged, first_number=first)
     with stage("match", len(instances)):
         known = compare(masks)
         for mend in regroup if config.repair_masks else ():
-            masks, old, new, identified = known
-            compared = Comparison.of(prior, [o for o, _ in old], new, identified, config)
-            mended = compared and mend(masks, compared)
-            known = compare(mended) if mended else known
-        masks, old, new, identified = known
-        return masks, old, new, with_left_over(identified, [o for o, _ in old], new, config)
+            if mended := mended_by(mend, known):
+                del known  # one comparison at a time: of a building each takes a gigabyte
+                known = compare(mended)
+        masks, old, new, found = known
+        return masks, old, new, with_left_over(found, [o for o, _ in old], new, config)
 
 
 def add_scan(
@@ -163,6 +168,7 @@ def added(
     found = identified.found
     with stage("register", len(found)):
         seen, frame = relocalize(prior, whole.objects, old, whole.instances, new, identified, index, config)
+    codes, identified, old, new = [o.embedding for o in new], identified.without_pairs(), (), ()
     pairs = [(f.object, f.instance) for f in found if config.repair_masks]
     mended = mend_splits(whole.objects, whole.instances, pairs, seen[: len(pairs)])
     objects = mended.objects
@@ -175,8 +181,7 @@ def added(
             objects = embed_accumulated(prior, objects, changed)
     missing, left = mended.left_over([(f.object, f.instance) for f in found])
     unseen = not_looked_at(objects, missing, level, frame.T_scene_scan, scene.upright)
-    first = next_number(objects, scene.scans)
-    fresh = new_objects(first, index, left, whole.instances, [o.embedding for o in new], frame)
+    fresh = new_objects(next_number(objects, scene.scans), index, left, whole.instances, codes, frame)
     chance = chances(identified, objects, fresh, config)
     objects, frame = as_given([*mended.whole(objects), *fresh.values()], index, frame, T_level_scan)
     repairs = (*whole.repairs, *whole.masks(found, fresh), *mended.repairs)

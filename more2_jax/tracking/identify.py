@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -48,6 +48,10 @@ class Identified:
     aligned: AlignedPairs | None = (
         None  # the pairs that surfaces were compared of, for registration to go on with
     )
+
+    def without_pairs(self) -> Identified:
+        """What is left to know once all are registered; the pairs are much of what a scene takes of memory."""
+        return replace(self, aligned=None)
 
 
 def identify(
