@@ -73,10 +73,8 @@ FIGURES = {
     "processor time a pair": ("processor time a pair", ""),
 }
 SENSE = {"higher": 1.0, "lower": -1.0}
-COUNTED = {
-    "reconstruction": "objects",
-    "segmentation": "objects",
-}  # what programs count, where it is not pairs
+# What programs count, where it is not pairs.
+COUNTED = {"reconstruction": "objects", "segmentation": "objects"}
 NO_RIVALS = ("building", "survival")  # programs whose lines are not methods
 OURS = "ours"  # methods whose names begin so
 

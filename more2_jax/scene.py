@@ -26,14 +26,7 @@ from more2_jax.tracking.changes import changes_between, forgotten, not_seen_in
 from more2_jax.tracking.comparison import Comparison
 from more2_jax.tracking.identify import Found, Identified, identify, with_left_over
 from more2_jax.tracking.joined_masks import join_parts
-from more2_jax.tracking.leveling import (
-    as_given,
-    level_by_objects,
-    level_of,
-    leveled,
-    shows_floor,
-    tells_up,
-)
+from more2_jax.tracking.leveling import as_given, level_by_objects, level_of, leveled, shows_floor, tells_up
 from more2_jax.tracking.looked_at import not_looked_at
 from more2_jax.tracking.mask_borders import mend_borders
 from more2_jax.tracking.merged_masks import divide_merged
@@ -125,7 +118,7 @@ def who_is_who(
         known = compare(masks)
         for mend in regroup if config.repair_masks else ():
             if mended := mended_by(mend, known):
-                del known  # one comparison at a time: of a building each takes a gigabyte
+                del known  # one comparison at a time is in memory
                 known = compare(mended)
         masks, old, new, found = known
         return masks, old, new, with_left_over(found, [o for o, _ in old], new, config)
@@ -147,6 +140,7 @@ def add_scan(
         T_level_scan = level_by_objects(found, scan)
         if T_level_scan is None:
             return found
+        scene = dataclasses.replace(scene, timing_s=found.timing_s)  # both took their time
     return added(prior, scene, scan, settled(config, scene.upright), progress, T_level_scan)
 
 
