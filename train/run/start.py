@@ -31,16 +31,17 @@ def started_cold(settings: TrainingRun, train: ShapeMix, name: str) -> Prior:
 def started_warm(model: PriorConfig, weights: str, name: str) -> Prior:
     """Weights that were trained before; with rows of zeros for what the decoder is to look up and did not.
 
-    Raises ValueError if they are not of this model.
+    Of two decoders both where the model has two. Raises ValueError if they are not of this model.
     """
-    prior = one_decoder(load_prior(weights), model.decoder.normals)
+    prior = load_prior(weights)
+    prior = prior if model.bare_decoder else one_decoder(prior, model.decoder.normals)
     if with_its_look_ups(prior, model) != prior.config.decoder:
         prior = looking_up_more(prior, model)
     scale = prior.config.encoder.output_scale  # measured at the start of their training, and theirs for good
     wanted = dataclasses.replace(model, encoder=dataclasses.replace(model.encoder, output_scale=scale))
     if different := [
         f
-        for f in ("encoder", "decoder", "eqv_gain", "inv_gain")
+        for f in ("encoder", "decoder", "eqv_gain", "inv_gain", "bare_decoder")
         if getattr(wanted, f) != getattr(prior.config, f)
     ]:
         raise ValueError(

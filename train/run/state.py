@@ -52,7 +52,7 @@ def initial_state(prior: Prior, config: TrainingConfig) -> TrainingState:
 
 def trained(params: dict[str, Any], config: TrainingConfig) -> dict[str, Any]:
     """The weights that steps change."""
-    return params if config.train == "all" else {"decoder": params["decoder"]}
+    return params if config.train == "all" else {k: v for k, v in params.items() if k != "encoder"}
 
 
 def draw(

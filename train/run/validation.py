@@ -13,7 +13,7 @@ from more2_jax.geometry.full_precision import full_precision
 from more2_jax.geometry.points import kabsch_rotation
 from more2_jax.network.prior import Prior, points_read
 from train.run.settings import TrainingConfig
-from train.shards.losses import predict
+from train.shards.losses import BARE, predict
 from train.shards.sampling import TrainingSample, sample_batch
 from train.shards.shards import Shapes
 
@@ -25,7 +25,8 @@ BATCH = 32
 def validate(prior: Prior, shapes: Shapes, config: TrainingConfig) -> dict[str, float]:
     """Means over up to `MOST_VALIDATED` shapes, clean clouds of up to three views: the same samples at every call.
 
-    Where the decoder looks up normals, `bare_*` are the scores of the same clouds without them.
+    Where the decoder looks up normals, `bare_*` are the scores of the same clouds without them, by the second decoder
+    if there is one.
     """
     clean = dataclasses.replace(
         config,
@@ -73,11 +74,12 @@ def field_scores(
 @full_precision
 def _sample_scores(prior: Prior, sample: TrainingSample) -> dict[str, Array]:
     embedding, predicted = predict(prior, sample, jax.random.key(0), train=False)
-    scores = field_scores(predicted, sample.sdf)
-    if prior.config.decoder.normals:
+    if prior.config.decoder.normals and not prior.config.bare_decoder:
         blind = dataclasses.replace(sample, normals=jnp.zeros_like(sample.normals))
-        _, predicted = predict(prior, blind, jax.random.key(0), train=False)
-        scores |= {f"bare_{k}": v for k, v in field_scores(predicted, sample.sdf).items()}
+        predicted[BARE] = predict(prior, blind, jax.random.key(0), train=False)[1][""]
+    scores = {
+        f"{of}{k}": v for of, field in predicted.items() for k, v in field_scores(field, sample.sdf).items()
+    }
     inv = embedding.inv / jnp.linalg.norm(embedding.inv, axis=-1, keepdims=True)
     inv = inv.reshape(-1, GROUP, *inv.shape[1:])
     cosine = jnp.einsum("gic,gjc->gij", inv[:, :, 0], inv[:, :, 1])

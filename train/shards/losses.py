@@ -15,11 +15,13 @@ from jaxtyping import Float
 from more2_jax.network.decoder import Decoder
 from more2_jax.network.prior import Prior, encode_ordered
 from more2_jax.network.row_map import in_turn
+from more2_jax.network.two_decoders import without_normals
 from more2_jax.types import Embedding
 from train.shards.sampling import TrainingSample
 from train.shards.settings import LossConfig
 
 AT_ONCE = 1024  # points of clouds that a CPU encodes side by side
+BARE = "bare_"  # what the terms of the decoder without normals begin with
 LEAST_CORRELATION = 0.05  # of two F_eqv, whose norms are 1: below it their rotation is noise, and pulls less
 
 
@@ -99,15 +101,20 @@ def total_loss(
     """
     embedding, predicted = predict(prior, sample, dropout_key, train=True, mesh=mesh)
     terms = {
-        "sdf": sdf_loss(predicted, sample.sdf, config.near_surface),
-        "sign": sign_loss(predicted, sample.sdf, config.sign_width),
+        f"{of}{term}": loss
+        for of, field in predicted.items()
+        for term, loss in {
+            "sdf": sdf_loss(field, sample.sdf, config.near_surface),
+            "sign": sign_loss(field, sample.sdf, config.sign_width),
+        }.items()
     }
     terms |= {} if config.train == "decoder" else code_terms(embedding, config)
     return sum((weight_of(k, config) * v for k, v in terms.items()), jnp.zeros(())), terms
 
 
 def weight_of(term: str, config: LossConfig) -> float:
-    """Of a term in the loss; that of the distance is the unit."""
+    """Of a term in the loss, the same for both decoders; that of the distance is the unit."""
+    term = term.removeprefix(BARE)
     return 1.0 if term == "sdf" else getattr(config, f"{term}_weight")
 
 
@@ -125,15 +132,23 @@ def code_terms(embedding: Embedding, config: LossConfig) -> dict[str, Float[Arra
 
 def predict(
     prior: Prior, sample: TrainingSample, dropout_key: Array, train: bool, mesh: Mesh | None = None
-) -> tuple[Embedding, Float[Array, "b 2 q"]]:
-    """Encodes both clouds of every shape and decodes the queries with each cloud's own code."""
-    decoder = Decoder(prior.config)
+) -> tuple[Embedding, dict[str, Float[Array, "b 2 q"]]]:
+    """Encodes both clouds of every shape and decodes the queries with each cloud's own code.
 
-    def one(params: dict[str, Any], cloud: tuple[Array, ...]) -> tuple[Embedding, Array]:
+    The distances are named "". Where a second decoder serves objects without normals, all clouds are asked of it
+    too: named `BARE`.
+    """
+    decoders = {"": ("decoder", Decoder(prior.config))}
+    if prior.config.bare_decoder:
+        decoders[BARE] = "bare_decoder", Decoder(without_normals(prior.config))
+
+    def one(params: dict[str, Any], cloud: tuple[Array, ...]) -> tuple[Embedding, dict[str, Array]]:
         points, mask, normals, queries, key = cloud
         e = encode_ordered(dataclasses.replace(prior, params=params), points, mask, normals, train)
-        weights = {"params": params["decoder"]}
-        return e, decoder.apply(weights, e, queries, train, rngs={"dropout": key})  # type: ignore[return-value]
+        return e, {  # type: ignore[return-value]
+            of: decoder.apply({"params": params[weights]}, e, queries, train, rngs={"dropout": key})
+            for of, (weights, decoder) in decoders.items()
+        }
 
     keys = jax.random.split(dropout_key, sample.sdf.shape[:2])
     by_shape = (sample.points, sample.mask, sample.normals, sample.queries, keys)

@@ -1,0 +1,118 @@
+"""Training both decoders together: each learns what it would learn alone, and the encoder from both."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from places import ROOT
+from sphere_shards import sphere_shards
+
+from more2_jax.config import load_config
+from more2_jax.network.prior import init_prior, save_prior
+from train.run.devices import device_mesh
+from train.run.settings import TrainingRun
+from train.run.shape_mix import load_mix
+from train.run.start import one_decoder, started_warm
+from train.run.state import initial_state, training_step
+from train.run.validation import validate
+from train.shards.losses import total_loss
+from train.shards.sampling import sample_batch
+
+pytestmark = pytest.mark.no_cover
+step = jax.jit(training_step.__wrapped__, static_argnames=("model", "config", "mesh"))
+
+
+@pytest.fixture(scope="module")
+def training():
+    """Gradients are never clipped, which would be by the length of both decoders' together."""
+    run = load_config(ROOT / "configs" / "tiny.yaml", TrainingRun)
+    return dataclasses.replace(
+        run.training, train="decoder", batch=2, queries=16, warmup_steps=0, sign_weight=0.2, clip=1e6
+    )
+
+
+@pytest.fixture(scope="module")
+def both():
+    model = load_config(ROOT / "configs" / "tiny.yaml", TrainingRun).model
+    look_up = {"local_blocks": (1, 3), "local_channels": 4, "bandwidths": (0.1,), "normals": True}
+    decoder = dataclasses.replace(model.decoder, narrow_skip=False, **look_up)
+    return init_prior(dataclasses.replace(model, decoder=decoder, bare_decoder=True), jax.random.key(3))
+
+
+@pytest.fixture(scope="module")
+def shapes(tmp_path_factory):
+    return load_mix([sphere_shards(tmp_path_factory.mktemp("shards"))], "train")[0]
+
+
+def stepped(prior, shapes, training):
+    mesh = device_mesh(1)
+    return step(
+        initial_state(prior, training),
+        shapes,
+        jnp.arange(2),
+        model=prior.config,
+        config=training,
+        mesh=mesh,
+    )
+
+
+def test_each_decoder_learns_what_it_would_learn_alone(both, shapes, training):
+    state, terms = stepped(both, shapes, training)
+    assert set(terms) == {"sdf", "sign", "bare_sdf", "bare_sign", "gradient"}
+    for name, of, normals in (("decoder", "", True), ("bare_decoder", "bare_", False)):
+        alone, own = stepped(one_decoder(both, normals), shapes, training)
+        for term in ("sdf", "sign"):
+            np.testing.assert_allclose(terms[of + term], own[term], rtol=1e-4)
+        moved = jax.tree.map(lambda a, b: a - b, state.params[name], both.params[name])
+        expected = jax.tree.map(lambda a, b: a - b, alone.params["decoder"], both.params[name])
+        largest = max(np.abs(x).max() for x in jax.tree.leaves(expected))
+        assert largest > 1e-5
+        # Adam's first step is the gradient's sign: where that is rounding, it says nothing.
+        far = jax.tree.map(lambda a, b: np.mean(np.abs(a - b) > 0.1 * largest), moved, expected)
+        assert max(jax.tree.leaves(far)) < 0.02
+    jax.tree.map(np.testing.assert_array_equal, state.params["encoder"], both.params["encoder"])
+
+
+def test_the_encoder_learns_from_both(both, shapes, training):
+    """Its gradient is the sum of those that each decoder alone has for it."""
+    sample = sample_batch(jax.random.key(5), shapes, jnp.arange(2), training, points=64)
+
+    @jax.jit
+    def gradient(prior):
+        def loss(encoder):
+            params = prior.params | {"encoder": encoder}
+            return total_loss(dataclasses.replace(prior, params=params), sample, training, jax.random.key(1))[
+                0
+            ]
+
+        return jax.grad(loss)(prior.params["encoder"])
+
+    seeing, bare = (jax.tree.leaves(gradient(one_decoder(both, normals))) for normals in (True, False))
+    largest = max(np.abs(x).max() for x in bare)
+    assert largest > 0
+    for found, a, b in zip(jax.tree.leaves(gradient(both)), seeing, bare, strict=True):
+        np.testing.assert_allclose(found, a + b, atol=1e-4 * largest)
+
+
+def test_both_go_on_from_weights_that_have_both_and_from_no_others(both, tmp_path):
+    save_prior(both, tmp_path / "two.npz", half=False)
+    begun = started_warm(both.config, str(tmp_path / "two.npz"), "mine")
+    assert (begun.name, begun.config) == ("mine", both.config)
+    jax.tree.map(np.testing.assert_array_equal, begun.params, both.params)
+    save_prior(one_decoder(both, normals=True), tmp_path / "one.npz", half=False)
+    with pytest.raises(ValueError, match="its bare_decoder is False; needed True"):
+        started_warm(both.config, str(tmp_path / "one.npz"), "mine")
+
+
+def test_validation_scores_both(both, tmp_path, training):
+    val = load_mix([sphere_shards(tmp_path)], "train")[0]
+    eight = jax.tree.map(lambda x: jnp.concatenate([x] * 8)[:8], val)
+    scores = validate(both, eight, training)
+    for normals, of in ((True, ""), (False, "bare_")):
+        alone = validate(one_decoder(both, normals), eight, training)
+        for k in ("sdf_l1", "near_sign"):
+            np.testing.assert_allclose(scores[of + k], alone[k], rtol=1e-4)
