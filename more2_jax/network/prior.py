@@ -24,6 +24,7 @@ from more2_jax.geometry.full_precision import full_precision
 from more2_jax.geometry.points import cleared, farthest_rows
 from more2_jax.network.decoder import Decoder, ObjectField
 from more2_jax.network.encoder import Encoder, neighbor_counts
+from more2_jax.network.row_map import in_blocks
 from more2_jax.network.two_decoders import decoder_weights, knows_normals, without_normals
 from more2_jax.types import Anchors, Embedding, PointCloud, pytree
 from more2_jax.whole_file import whole_file
@@ -194,8 +195,9 @@ def object_field(prior: Prior, embedding: Embedding) -> ObjectField:
 @full_precision
 def field_sdf(prior: Prior, field: ObjectField, points: Float[Array, "n 3"]) -> Float[Array, " n"]:
     """Signed distance at points of the embedding's local frame; canonical units, negative inside."""
-    weights = decoder_weights(prior.params, prior.config, field.known)
-    return Decoder(prior.config).apply({"params": weights}, field, points, method="distance")  # type: ignore[return-value]
+    weights = {"params": decoder_weights(prior.params, prior.config, field.known)}
+    decoder = Decoder(prior.config)
+    return in_blocks(lambda some: decoder.apply(weights, field, some, method="distance"), points)  # type: ignore[return-value]
 
 
 def sdf_one(prior: Prior, embedding: Embedding, points: Float[Array, "n 3"]) -> Float[Array, " n"]:

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from places import ROOT
 
-from more2_jax.network.row_map import in_turn
+from more2_jax.network.row_map import in_blocks, in_turn
 
 ROWS = {"a": jax.random.normal(jax.random.key(0), (12, 5)), "b": jnp.arange(12.0)}
 
@@ -97,3 +97,38 @@ def test_only_so_many_are_at_work_at_once():
 
     if jax.default_backend() == "cpu":
         assert bytes_of(1) * 4 < bytes_of(16)
+
+
+@pytest.mark.parametrize("count", [0, 1, 4, 5, 8, 11])
+def test_blocks_of_rows_give_what_all_rows_give(count):
+    """Values, and both gradients: by the rows, and by what the function closes over. The last block is part filled."""
+    rows = jax.random.normal(jax.random.key(2), (count, 5))
+
+    def total(over):
+        def of(weight, rows):
+            return jnp.sum(over(lambda some: jnp.tanh(some @ weight) * some[:, 0], rows) ** 2)
+
+        return jax.value_and_grad(of, (0, 1))(WEIGHT, rows)
+
+    found = total(lambda f, rows: in_blocks(f, rows, 4))
+    wanted = total(lambda f, rows: f(rows))
+    jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, rtol=1e-5, atol=1e-7), found, wanted)
+
+
+def test_blocks_of_batches_are_those_of_each():
+    rows = jax.random.normal(jax.random.key(3), (3, 10, 5))
+    found = jax.vmap(lambda x: in_blocks(lambda some: some @ WEIGHT, x, 4))(rows)
+    np.testing.assert_allclose(found, rows @ WEIGHT, rtol=1e-5, atol=1e-6)
+
+
+def test_no_more_than_a_block_is_computed_at_once():
+    """The peak of memory does not grow with the rows."""
+
+    def wide(some):
+        return jnp.sin(some[:, :1] * jnp.arange(1.0, 20_001.0)).sum(axis=-1)
+
+    def bytes_of(count):
+        program = jax.jit(lambda rows: in_blocks(wide, rows, 4)).lower(jnp.ones((count, 5))).compile()
+        return program.memory_analysis().temp_size_in_bytes
+
+    assert bytes_of(400) < 2 * bytes_of(8)

@@ -72,8 +72,11 @@ def test_each_decoder_learns_what_it_would_learn_alone(both, shapes, training):
         largest = max(np.abs(x).max() for x in jax.tree.leaves(expected))
         assert largest > 1e-5
         # Adam's first step is the gradient's sign: where that is rounding, it says nothing.
-        far = jax.tree.map(lambda a, b: np.mean(np.abs(a - b) > 0.1 * largest), moved, expected)
-        assert max(jax.tree.leaves(far)) < 0.02
+        off = [
+            np.abs(a - b) > 0.1 * largest
+            for a, b in zip(*map(jax.tree.leaves, (moved, expected)), strict=True)
+        ]
+        assert max(np.mean(x) for x in off) < 0.02
     jax.tree.map(np.testing.assert_array_equal, state.params["encoder"], both.params["encoder"])
 
 
