@@ -43,7 +43,12 @@ class SampledPair:
 
 def register_by_descent(prior: Prior, pairs: PairBatch, settings: DescentRegistration) -> Registration:
     """All pairs of a batch; from the poses handed on by matching, or (paper §3.3) from Kabsch on the codes."""
-    return jax.vmap(lambda pair: register_pair(prior, sampled(pair, settings), settings))(pairs)
+
+    def one(pair: PairBatch) -> Registration:
+        return register_pair(prior, sampled(pair, settings), settings)
+
+    # On CPUs one by one: what a step compares of a pair, every point with every other, fills the caches.
+    return jax.lax.map(one, pairs) if jax.default_backend() == "cpu" else jax.vmap(one)(pairs)
 
 
 def sampled(pair: PairBatch, settings: DescentRegistration) -> SampledPair:

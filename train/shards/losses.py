@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from more2_jax.network.decoder import Decoder
 from more2_jax.network.prior import Prior, encode_ordered
-from more2_jax.network.row_map import in_turn
+from more2_jax.network.row_map import in_blocks, in_turn
 from more2_jax.network.two_decoders import without_normals
 from more2_jax.types import Embedding
 from train.shards.sampling import TrainingSample
@@ -145,10 +145,14 @@ def predict(
     def one(params: dict[str, Any], cloud: tuple[Array, ...]) -> tuple[Embedding, dict[str, Array]]:
         points, mask, normals, queries, key = cloud
         e = encode_ordered(dataclasses.replace(prior, params=params), points, mask, normals, train)
-        return e, {  # type: ignore[return-value]
-            of: decoder.apply({"params": params[weights]}, e, queries, train, rngs={"dropout": key})
-            for of, (weights, decoder) in decoders.items()
-        }
+        def distances(weights: str, decoder: Decoder) -> Array:
+            def asked(some: Array) -> Array:
+                return decoder.apply({"params": params[weights]}, e, some, train, rngs={"dropout": key})  # type: ignore[return-value]
+
+            # Blocks would drop the same units of every block.
+            return asked(queries) if decoder.config.decoder.dropout else in_blocks(asked, queries)
+
+        return e, {of: distances(*asked) for of, asked in decoders.items()}
 
     keys = jax.random.split(dropout_key, sample.sdf.shape[:2])
     by_shape = (sample.points, sample.mask, sample.normals, sample.queries, keys)
