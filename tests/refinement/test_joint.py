@@ -195,14 +195,15 @@ def test_moving_the_code_is_encoding_what_was_moved(tiny_prior, factor):
     np.testing.assert_allclose(after.center + after.origin, expected.center, atol=1e-4 * length)
 
 
+def exact(tree):
+    """In double precision, if JAX has it."""
+    floats = lambda x: jnp.issubdtype(x.dtype, jnp.floating)  # noqa: E731
+    return jax.tree.map(lambda x: jnp.asarray(np.asarray(x), float if floats(x) else x.dtype), tree)
+
+
 @pytest.fixture
 def in_float64(tiny_prior, seen):
     """Prior and an object seen three times in double precision; what is real and masked stays on the host, in NumPy."""
-
-    def exact(tree):
-        floats = lambda x: jnp.issubdtype(x.dtype, jnp.floating)  # noqa: E731
-        return jax.tree.map(lambda x: jnp.asarray(np.asarray(x), float if floats(x) else x.dtype), tree)
-
     with jax.enable_x64(True):
         prior, few = exact(
             (tiny_prior, jax.tree.map(lambda x: x[:1, :3], dataclasses.replace(seen, accumulated=seen.codes)))
