@@ -223,7 +223,7 @@ class MeshingConfig:
     outlier_factor_multi_scan: float = 0.0
     clip_to_floor: bool = False  # Whether meshes end at the floor, if scans are upright and show it.
     # Where meshes are made: one at a time on the host, or many at once on the device. "auto": on CPUs the host, which
-    # is faster there; on accelerators the device, which has not been measured there.
+    # is faster there; on accelerators the device, of which one demo has been timed there.
     engine: Literal["auto", "host", "device"] = "auto"
 
 
