@@ -30,7 +30,7 @@ from more2_jax.config import PriorConfig, load_config
 from more2_jax.geometry.points import farthest_points
 from more2_jax.network.decoder import Decoder
 from more2_jax.network.prior import Prior, encode_ordered, init_prior
-from more2_jax.network.row_map import in_turn
+from more2_jax.network.row_map import in_blocks, in_turn
 from train.run.devices import by_rows, cores, device_a_core, device_mesh, everywhere
 from train.run.memory import GLIBC_KEEPS_MEMORY, keep_freed_memory
 from train.run.program import run
@@ -114,7 +114,8 @@ def distances(prior: Prior, points: Array, queries: Array, plain: bool) -> Array
         return plain_layers.decode(prior.params["decoder"], code, queries, prior.config)
     e = encode_ordered(prior, points, jnp.ones(len(points), bool))
     decoder = Decoder(prior.config)
-    return decoder.apply({"params": prior.params["decoder"]}, e, queries, train=True)  # type: ignore[return-value]
+    weights = {"params": prior.params["decoder"]}
+    return in_blocks(lambda some: decoder.apply(weights, e, some, train=True), queries)  # type: ignore[return-value]
 
 
 def jax_jobs(model: PriorConfig, batch: tuple[Array, Array, Array], plain: bool) -> dict[str, Job]:
