@@ -145,6 +145,7 @@ def predict(
     def one(params: dict[str, Any], cloud: tuple[Array, ...]) -> tuple[Embedding, dict[str, Array]]:
         points, mask, normals, queries, key = cloud
         e = encode_ordered(dataclasses.replace(prior, params=params), points, mask, normals, train)
+
         def distances(weights: str, decoder: Decoder) -> Array:
             def asked(some: Array) -> Array:
                 return decoder.apply({"params": params[weights]}, e, some, train, rngs={"dropout": key})  # type: ignore[return-value]
