@@ -13,25 +13,22 @@ from sphere_shards import sphere_shards
 
 from more2_jax.config import load_config
 from more2_jax.network.prior import init_prior, save_prior
-from train.run.devices import device_mesh
 from train.run.settings import TrainingRun
 from train.run.shape_mix import load_mix
 from train.run.start import one_decoder, started_warm
-from train.run.state import initial_state, training_step
+from train.run.state import trained
 from train.run.validation import validate
 from train.shards.losses import total_loss
 from train.shards.sampling import sample_batch
 
 pytestmark = pytest.mark.no_cover
-step = jax.jit(training_step.__wrapped__, static_argnames=("model", "config", "mesh"))
 
 
 @pytest.fixture(scope="module")
 def training():
-    """Gradients are never clipped, which would be by the length of both decoders' together."""
     run = load_config(ROOT / "configs" / "tiny.yaml", TrainingRun)
     return dataclasses.replace(
-        run.training, train="decoder", batch=2, queries=16, warmup_steps=0, sign_weight=0.2, clip=1e6
+        run.training, train="decoder", batch=2, queries=16, warmup_steps=0, sign_weight=0.2
     )
 
 
@@ -48,57 +45,48 @@ def shapes(tmp_path_factory):
     return load_mix([sphere_shards(tmp_path_factory.mktemp("shards"))], "train")[0]
 
 
-def stepped(prior, shapes, training):
-    mesh = device_mesh(1)
-    return step(
-        initial_state(prior, training),
-        shapes,
-        jnp.arange(2),
-        model=prior.config,
-        config=training,
-        mesh=mesh,
-    )
-
-
-def test_each_decoder_learns_what_it_would_learn_alone(both, shapes, training):
-    state, terms = stepped(both, shapes, training)
-    assert set(terms) == {"sdf", "sign", "bare_sdf", "bare_sign", "gradient"}
-    for name, of, normals in (("decoder", "", True), ("bare_decoder", "bare_", False)):
-        alone, own = stepped(one_decoder(both, normals), shapes, training)
-        for term in ("sdf", "sign"):
-            np.testing.assert_allclose(terms[of + term], own[term], rtol=1e-4)
-        moved = jax.tree.map(lambda a, b: a - b, state.params[name], both.params[name])
-        expected = jax.tree.map(lambda a, b: a - b, alone.params["decoder"], both.params[name])
-        largest = max(np.abs(x).max() for x in jax.tree.leaves(expected))
-        assert largest > 1e-5
-        # Adam's first step is the gradient's sign: where that is rounding, it says nothing.
-        off = [
-            np.abs(a - b) > 0.1 * largest
-            for a, b in zip(*map(jax.tree.leaves, (moved, expected)), strict=True)
-        ]
-        assert max(np.mean(x) for x in off) < 0.02
-    jax.tree.map(np.testing.assert_array_equal, state.params["encoder"], both.params["encoder"])
-
-
-def test_the_encoder_learns_from_both(both, shapes, training):
-    """Its gradient is the sum of those that each decoder alone has for it."""
-    sample = sample_batch(jax.random.key(5), shapes, jnp.arange(2), training, points=64)
+@pytest.fixture(scope="module")
+def gradients(both, shapes, training):
+    """Loss terms, and gradient by all weights: of both decoders together, then of each alone."""
+    draw = jax.jit(sample_batch, static_argnames=("config", "points"))
+    sample = draw(jax.random.key(5), shapes, jnp.arange(2), training, points=64)
 
     @jax.jit
     def gradient(prior):
-        def loss(encoder):
-            params = prior.params | {"encoder": encoder}
-            return total_loss(dataclasses.replace(prior, params=params), sample, training, jax.random.key(1))[
-                0
-            ]
+        def loss(params):
+            return total_loss(dataclasses.replace(prior, params=params), sample, training, jax.random.key(1))
 
-        return jax.grad(loss)(prior.params["encoder"])
+        return jax.grad(loss, has_aux=True)(prior.params)
 
-    seeing, bare = (jax.tree.leaves(gradient(one_decoder(both, normals))) for normals in (True, False))
-    largest = max(np.abs(x).max() for x in bare)
+    return [gradient(p) for p in (both, one_decoder(both, normals=True), one_decoder(both, normals=False))]
+
+
+def test_each_decoder_learns_what_it_would_learn_alone(gradients):
+    (found, terms), seeing, bare = gradients
+    assert set(terms) == {"sdf", "sign", "bare_sdf", "bare_sign"}
+    for name, of, (alone, own) in (("decoder", "", seeing), ("bare_decoder", "bare_", bare)):
+        for term in ("sdf", "sign"):
+            np.testing.assert_allclose(terms[of + term], own[term], rtol=1e-4)
+        agree(found[name], alone["decoder"])
+
+
+def test_the_encoder_learns_from_both(gradients):
+    """Its gradient is the sum of those that each decoder alone has for it."""
+    both, seeing, bare = (tree["encoder"] for tree, _ in gradients)
+    agree(both, jax.tree.map(jnp.add, seeing, bare))
+    assert max(np.abs(x).max() for x in jax.tree.leaves(bare)) > 0
+
+
+def agree(found, expected):
+    largest = max(np.abs(x).max() for x in jax.tree.leaves(expected))
     assert largest > 0
-    for found, a, b in zip(jax.tree.leaves(gradient(both)), seeing, bare, strict=True):
-        np.testing.assert_allclose(found, a + b, atol=1e-4 * largest)
+    for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-4 * largest)
+
+
+def test_steps_of_the_decoder_change_both_and_leave_the_encoder(both, training):
+    assert set(trained(both.params, training)) == {"decoder", "bare_decoder"}
+    assert set(trained(both.params, dataclasses.replace(training, train="all"))) == set(both.params)
 
 
 def test_both_go_on_from_weights_that_have_both_and_from_no_others(both, tmp_path):
