@@ -129,19 +129,23 @@ def measured(options: Settings, count: int) -> Measured:
     if options.keep_masks:
         config = replace(config, repair_masks=False)
     folders = sorted(p.parent for p in options.data.glob("scene_*/scene.json"))
-    scans, truth = building([read_scene(folder) for folder in folders], count, options.points)
+    (first, second), truth = building([read_scene(folder) for folder in folders], count, options.points)
+    counts = [len(s.instances) for s in (first, second)]
+    points = sum(len(i.points) for s in (first, second) for i in s.instances)
     watch = Watch()
-    scene = start_scene(prior, scans[0], config, progress=watch)
+    scene = start_scene(prior, first, config, progress=watch)
+    del first  # as `more2 run` reads one scan after the other
     watch.mark("rest")
-    scene = add_scan(prior, scene, scans[1], config, progress=watch)
+    scene = add_scan(prior, scene, second, config, progress=watch)
+    del second
     watch.mark("rest")
     if options.meshes:
         scene = reconstruct(prior, scene, config, progress=watch)
         watch.mark("rest")
     return Measured(
-        objects=len(scans[0].instances),
-        instances=len(scans[1].instances),
-        points=sum(len(i.points) for s in scans for i in s.instances),
+        objects=counts[0],
+        instances=counts[1],
+        points=points,
         seconds=watch.seconds,
         cpu_seconds=watch.cpu_seconds,
         peak_mb=watch.peak_mb,

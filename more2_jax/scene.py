@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from more2_jax.config import EvidenceMatcher, SceneConfig
+from more2_jax.freed_memory import give_back
 from more2_jax.geometry.poses import Points, Pose, apply_pose
 from more2_jax.matching.color import color_of
 from more2_jax.meshing.engine import meshes_of_objects
@@ -21,6 +22,7 @@ from more2_jax.network.shared_calls import side_by_side
 from more2_jax.progress import Watcher, staged
 from more2_jax.refinement.joint_of_objects import fit_objects
 from more2_jax.refinement.pose_graph_of_objects import refine_object_poses
+from more2_jax.registration.pose_costs import asks_sensors
 from more2_jax.tracking.accumulated import accumulated_objects, embed_accumulated, readable, with_refined
 from more2_jax.tracking.changes import changes_between, forgotten, not_seen_in
 from more2_jax.tracking.comparison import Comparison
@@ -30,10 +32,10 @@ from more2_jax.tracking.leveling import as_given, level_by_objects, level_of, le
 from more2_jax.tracking.looked_at import not_looked_at
 from more2_jax.tracking.mask_borders import mend_borders
 from more2_jax.tracking.merged_masks import divide_merged
-from more2_jax.tracking.object_views import few_sensors, instance_sights, object_sights
-from more2_jax.tracking.objects import SCENE_FRAME, accumulated, new_objects, next_number, seen_again
+from more2_jax.tracking.object_views import Views, few_sensors
+from more2_jax.tracking.objects import SCENE_FRAME, accumulated, new_objects, next_number
 from more2_jax.tracking.regrouped import Regrouped
-from more2_jax.tracking.relocalize import known_object, relocalize
+from more2_jax.tracking.relocalize import known_object, relocalize, with_observations
 from more2_jax.tracking.room_points import Cleared, without_room
 from more2_jax.tracking.scan_frame import Rooms
 from more2_jax.tracking.split_masks import mend_splits
@@ -104,6 +106,7 @@ def who_is_who(
     rooms, first = rooms_of(scene, scan), next_number(scene.objects, scene.scans)
 
     def compare(masks: Regrouped) -> Compared:
+        give_back(len(instances))
         known = dataclasses.replace(scene, objects=tuple(masks.objects))
         old, new = compared_objects(known, masks.instances, masks.embeddings, scan, config)
         return masks, old, new, identify(prior, [o for o, _ in old], new, config, rooms)
@@ -121,7 +124,7 @@ def who_is_who(
                 del known  # one comparison at a time is in memory
                 known = compare(mended)
         masks, old, new, found = known
-        return masks, old, new, with_left_over(found, [o for o, _ in old], new, config)
+        return masks, old, new, with_left_over(found, [o for o, _ in old], new, config).without_seen()
 
 
 def add_scan(
@@ -161,13 +164,12 @@ def added(
     whole, old, new, identified = who_is_who(prior, scene, cleared.instances, level, config, stage)
     found = identified.found
     with stage("register", len(found)):
-        seen, frame = relocalize(prior, whole.objects, old, whole.instances, new, identified, index, config)
-    codes, identified, old, new = [o.embedding for o in new], identified.without_pairs(), (), ()
+        views = Views(whole.objects, scene.scans, whole.instances, level, remembered(level.background))
+        seen, frame = relocalize(prior, views, old, new, identified, index, config)
+    codes, identified, views, old, new = [o.embedding for o in new], identified.without_pairs(), None, (), ()
     pairs = [(f.object, f.instance) for f in found if config.repair_masks]
     mended = mend_splits(whole.objects, whole.instances, pairs, seen[: len(pairs)])
-    objects = mended.objects
-    for f, observation in zip(found, seen, strict=True):
-        objects[f.object] = seen_again(objects[f.object], mended.instances[f.instance], observation)
+    objects = with_observations(mended.objects, mended.instances, found, seen)
     objects, borders = with_borders_mended(objects, found, scene, level, config)
     if config.accumulate_target:
         with stage("encode", len(found)):
@@ -275,8 +277,10 @@ def compared_objects(
     config: SceneConfig,
 ) -> tuple[list[tuple[ObservedObject, Pose]], list[ObservedObject]]:
     """Returns objects (in the scene's frame, with the pose to their own) and instances as the stages take them."""
-    of_objects = object_sights(scene.objects, scene.scans)
-    of_instances = instance_sights(instances, scan, remembered(scan.background))
+    of_objects, of_instances = [None] * len(scene.objects), [None] * len(instances)
+    if isinstance(config.matching, EvidenceMatcher) and asks_sensors(config.matching.search, config.motion):
+        views = Views(scene.objects, scene.scans, instances, scan, remembered(scan.background))
+        of_objects, of_instances = views.of_objects(), views.of_instances()
     near, beside = surroundings_where_masks_may_be_wrong(scene, instances, scan, config)
     old = [
         known_object(o, view, config, around)
@@ -332,6 +336,7 @@ def with_borders_mended(
     objects: list[SceneObject], found: Sequence[Found], scene: LivingScene, scan: Scan, config: SceneConfig
 ) -> tuple[list[SceneObject], tuple[Repair, ...]]:
     """Returns the objects with the borders of their masks repaired. `scan`: the new one, leveled."""
+    give_back(len(objects))  # what registration took
     if not config.repair_masks:
         return objects, ()
     index = len(scene.scans)

@@ -64,7 +64,7 @@ def run_scans(
 def _build(
     session: Session,
     prior: Prior,
-    scans: Sequence[Scan],
+    scans: list[Scan],
     out: Path,
     config: SceneConfig,
     scene: LivingScene | None,
@@ -72,15 +72,17 @@ def _build(
     """Adds the scans `scene` lacks, saves after each, reconstructs and saves. What stops it says what is kept."""
     from more2_jax.scene import add_scan, reconstruct, start_scene
 
-    kept = 0 if scene is None else len(scene.scans)
-    session.steps = (1 if kept == 0 else 0) + _stages_of_add(config) * (len(scans) - max(kept, 1)) + 2
+    kept, count = 0 if scene is None else len(scene.scans), len(scans)
+    session.steps = (1 if kept == 0 else 0) + _stages_of_add(config) * (count - max(kept, 1)) + 2
+    del scans[:kept]
     try:
-        for scan in scans[kept:]:
+        while scans:
             if scene is None:
-                scene = start_scene(prior, scan, config, progress=session.watch)
-                _say_how_objects_move(session, scene, scan, config)
+                scene = start_scene(prior, scans[0], config, progress=session.watch)
+                _say_how_objects_move(session, scene, scans[0], config)
             else:
-                scene = add_scan(prior, scene, scan, config, progress=session.watch)
+                scene = add_scan(prior, scene, scans[0], config, progress=session.watch)
+            del scans[0]  # none stays in memory once it is added
             _say_done(session, scene)
             _store(session, scene, out, config)
             kept += 1
@@ -91,7 +93,7 @@ def _build(
         _save(session, scene, out, config)
         return scene
     except (KeyboardInterrupt, OSError) as error:
-        how = f"{kept} of {len(scans)} scans are kept in {out}; the same command with --resume goes on"
+        how = f"{kept} of {count} scans are kept in {out}; the same command with --resume goes on"
         if isinstance(error, OSError):
             raise type(error)(f"{reason_of(error)}; {how if kept else f'{out} is as it was'}") from error
         if not kept:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+
 import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial import KDTree
@@ -15,16 +17,21 @@ RADIUS_M = CELL_M * np.sqrt(3) / 2  # of the ball that holds a cell
 SIDES = np.array([1 << 42, 1 << 21, 1])
 
 
+Made = Callable[[], Points]  # a cloud, when it is needed
+
+
 class NearPoints:
     """Points (meters) of which those near places, or in view from them, are asked for."""
 
     def __init__(self, points: Points) -> None:
-        cell = np.floor(points / CELL_M).astype(np.int64)
-        order = np.argsort(cell @ SIDES, kind="stable")
-        self._given, self._order, self._points = points, order, points[order]
-        _, first = np.unique((cell @ SIDES)[order], return_index=True)
+        number = np.zeros(len(points), np.int64)
+        for side, x in zip(SIDES, points.T, strict=True):  # one axis at a time: large scans
+            number += side * np.floor(x / CELL_M).astype(np.int64)
+        order = np.argsort(number, kind="stable")
+        _, first = np.unique(number[order], return_index=True)
+        self._order, self._points = order.astype(np.int32), points[order]  # all that is kept of a large scan
         self._ends = np.append(first, len(points))
-        self._center = (cell[order[first]] + 0.5) * CELL_M
+        self._center = (np.floor(self._points[first] / CELL_M) + 0.5) * CELL_M
         self._tree = KDTree(self._center) if len(first) else None
 
     def cells_around(self, place: Float[np.ndarray, "3"], reach_m: float) -> Int[np.ndarray, " c"]:
@@ -60,5 +67,40 @@ class NearPoints:
         """The points of a box, and some beside it, in the order in which they were given."""
         apart = np.abs(self._center - (low + high) / 2) - (high - low) / 2
         cells = np.flatnonzero((apart <= CELL_M / 2 + TOUCHING_M).all(axis=1))
-        parts = [self._order[self._ends[c] : self._ends[c + 1]] for c in cells.tolist()]
-        return self._given[np.sort(np.concatenate(parts))] if parts else self._given[:0]
+        given = [self._order[self._ends[c] : self._ends[c + 1]] for c in cells.tolist()]
+        return self.points_of(cells)[np.argsort(np.concatenate(given))] if given else self._points[:0]
+
+
+class NearClouds:
+    """Clouds of a large scan, of which those near some places are put in order together.
+
+    What was put in order last is kept: rooms of one size are asked the same again and again.
+    """
+
+    def __init__(self, clouds: Sequence[Made], rest: Points) -> None:
+        """`rest`: points that belong to every place, such as the background."""
+        balls = [ball_around(cloud()) for cloud in clouds]
+        self._clouds, self._rest = clouds, rest
+        self._center = np.reshape([center for center, _ in balls], (-1, 3))
+        self._radius = np.array([radius for _, radius in balls])
+        self._last: tuple[tuple[int, ...], NearPoints] | None = None
+
+    def near(self, places: Sequence[Float[np.ndarray, "3"]], reach_m: float) -> NearPoints:
+        """All points in the cells within the reach of a place (`NearPoints.cells_around`), and some beside."""
+        reach = reach_m + 2 * RADIUS_M + self._radius + TOUCHING_M
+        near = np.zeros(len(self._clouds), bool)
+        for place in places:
+            near |= np.linalg.norm(self._center - place, axis=1) <= reach
+        rows = tuple(np.flatnonzero(near).tolist())
+        if self._last is None or self._last[0] != rows:
+            self._last = None  # let go before the next one is made
+            self._last = rows, NearPoints(np.concatenate([*(self._clouds[k]() for k in rows), self._rest]))
+        return self._last[1]
+
+
+def ball_around(points: Points) -> tuple[Float[np.ndarray, "3"], float]:
+    """The center and radius of a ball that holds the points; of none, one that nothing reaches."""
+    if not len(points):
+        return np.zeros(3), -np.inf
+    center = (points.min(axis=0) + points.max(axis=0)) / 2
+    return center, float(np.linalg.norm(points - center, axis=1).max())

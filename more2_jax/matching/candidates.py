@@ -45,6 +45,7 @@ from more2_jax.registration.search import (
     alignable,
     rows_taken,
     search_poses,
+    searched,
 )
 from more2_jax.types import ObservedObject
 
@@ -61,7 +62,9 @@ class AlignedPairs:
 
     rows: Int[np.ndarray, "p 2"]  # (object, instance), by objects, then by instances
     sides: tuple[Sequence[ObservedObject], Sequence[ObservedObject]]  # instances (m) and objects (n)
-    ready: tuple[AlignableObject, AlignableObject]  # prepared; what sensors saw only where a search asks
+    # Prepared; what sensors saw only where a search asks. Of many objects only what a comparison needs.
+    ready: tuple[AlignableObject, AlignableObject]
+    search: SurfaceSearch  # that they were prepared for
     stayed: jaxlie.SE3  # (p,): "it did not move", an instance's local frame to the object's
     found: FoundPoses  # (p, k), local frames: instances onto objects
     T_old_new: Float[np.ndarray, "p k 4 4"]  # those poses between the clouds' frames, float64
@@ -78,16 +81,26 @@ class AlignedPairs:
         """Numbers of objects and of instances."""
         return len(self.sides[1]), len(self.sides[0])
 
-    def take(self, chosen: Sequence[tuple[int, int]]) -> PairBatch:
-        """Some pairs (object, instance) as registration takes them: with the poses found, and as prepared."""
+    def take(
+        self,
+        chosen: Sequence[tuple[int, int]],
+        sides: tuple[Sequence[ObservedObject], Sequence[ObservedObject]] | None = None,
+    ) -> PairBatch:
+        """Some pairs (object, instance) as registration takes them: with the poses found, and as prepared.
+
+        `sides`: the same instances and objects, by which more is known of what sensors saw.
+        """
         at = self.rows_of(chosen)
         ends = self.rows[at, 1], self.rows[at, 0]
         source, target = (
             local_batch([side[k] for k in end], len(end), side)
-            for side, end in zip(self.sides, ends, strict=True)
+            for side, end in zip(sides or self.sides, ends, strict=True)
         )
-        ready = rows_taken(self.ready, np.stack(ends, axis=1))
         sights = source.sight, target.sight
+        ready = rows_taken(self.ready, np.stack(ends, axis=1))
+        if self.ready[0].whole is None:
+            blind = (dataclasses.replace(side, sight=None) for side in (source, target))
+            ready = tuple(alignable(side, self.search) for side in blind)
         stayed, poses = jax.tree.map(lambda x: x[at], (self.stayed, self.found.poses))
         return PairBatch(
             source=source,
@@ -124,7 +137,9 @@ def align_candidates(
     T = np.eye(4) if T_scene_scan is None else T_scene_scan
     worth = proposed(old, new, matcher, T if place is None else place)
     rows = worth.pairs[:, ::-1]
-    (instances, of_new), (objects, of_old) = (prepared(side, matcher.search) for side in (new, old))
+    few = max(len(old), len(new)) <= OBJECTS_AT_ONCE
+    instances, of_new = prepared(new, matcher.search, motion, few)
+    objects, of_old = prepared(old, matcher.search, motion, few)
     ready, ends = (instances, objects), (of_old[rows[:, 1]], of_new[rows[:, 0]])
     stayed = local_poses(np.broadcast_to(T, (len(rows), 4, 4)), *ends)
     found = search_poses(*ready, stayed, matcher.search, motion, rows)
@@ -133,9 +148,8 @@ def align_candidates(
     seen = (seen or seen_in(old, new)) if motion == "upright" else None
     samples = samples_of(instances, of_new), samples_of(objects, of_old)
     return AlignedPairs(
-        rows=worth.pairs,
-        sides=(new, old),
         ready=ready,
+        search=matcher.search,
         stayed=stayed,
         found=found,
         T_old_new=T_old_new,
@@ -157,6 +171,8 @@ def known_of(
     new, old = sides
     k, i = worth.pairs.T
     return {
+        "rows": worth.pairs,
+        "sides": sides,
         "metric": metric_evidence(sides, samples, worth.pairs[:, ::-1], T_old_new, seen),
         "compared": compared(old, new, worth),
         "top_gap_m": heights(old)[1][k] - heights(new)[1][i],
@@ -184,20 +200,22 @@ def told_by_prior(
 
 
 def prepared(
-    side: Sequence[ObservedObject], search: SurfaceSearch
+    side: Sequence[ObservedObject], search: SurfaceSearch, motion: MotionModel, keep: bool
 ) -> tuple[AlignableObject, Float[np.ndarray, "b 3"]]:
     """The objects of one scan ready to be aligned, and the origins of their local frames.
 
     `OBJECTS_AT_ONCE` are padded at a time; without what sensors saw, which only a search with a `free_weight` reads.
+    `keep`: with all that registration reads as well, 0.3 MB an object; else, in any orientation, half of it.
     """
     ready, origins = list[AlignableObject](), list[np.ndarray]()
     for start in range(0, len(side), OBJECTS_AT_ONCE):
         some = side[start : start + OBJECTS_AT_ONCE]
         batch = local_batch(some, len(some), side)
         origins.append(host_origin(batch))
-        ready.append(
-            alignable(batch if search.free_weight else dataclasses.replace(batch, sight=None), search)
-        )
+        every = alignable(batch if search.free_weight else dataclasses.replace(batch, sight=None), search)
+        if not keep:
+            every = dataclasses.replace(every, whole=None) if asks_prior(search, motion) else searched(every)
+        ready.append(every)
     return jax.tree.map(lambda *x: np.concatenate(x), *ready), np.concatenate(origins)
 
 

@@ -36,11 +36,7 @@ def seen_in(
     scan: Points = NOWHERE,
 ) -> Seen:
     """All that the scene so far shows (its objects and `scene`) and all that the new scan shows, upright."""
-    old_space, new_space = (
-        SeenSpace(np.concatenate([rest, *(o.points for o in side)]))
-        for rest, side in ((scene, old), (scan, new))
-    )
-    return old_space, new_space
+    return SeenSpace([scene, *(o.points for o in old)]), SeenSpace([scan, *(o.points for o in new)])
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -72,6 +72,11 @@ def height_cost(
     return search.lift_weight * jnp.minimum(height / LIFTED, 1.0)
 
 
+def asks_sensors(search: SurfaceSearch, motion: MotionModel) -> bool:
+    """Whether `free_space_cost` reads what sensors saw."""
+    return motion == "upright" and search.free_weight > 0
+
+
 def free_space_cost(
     poses: jaxlie.SE3,
     surfaces: tuple[Surface, Surface],
@@ -85,7 +90,7 @@ def free_space_cost(
     (docs/developing/notebook/registration_parts.md).
     """
     cost = jnp.zeros(poses.wxyz_xyz.shape[0])
-    if motion != "upright" or not search.free_weight:
+    if not asks_sensors(search, motion):
         return cost
     ways = ((sights[1], surfaces[0], lambda T: T), (sights[0], surfaces[1], lambda T: T.inverse()))
     for sight, surface, way in ways:

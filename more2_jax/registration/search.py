@@ -6,6 +6,7 @@ is prepared once, whatever number of pairs it is part of.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from functools import partial
 
@@ -44,11 +45,18 @@ SAME_DEG = 10.0  # of starts that have come this near to one another's rotation 
 class AlignableObject:
     """An object ready to be aligned, in its local frame, meters."""
 
-    whole: Surface = quantity("record")  # all of its points, with normals, and what lies around them
+    # All of its points, with normals, and what lies around them; None where only a search is to follow.
+    whole: Surface | None = quantity("record")
     coarse: Surface = quantity("record")  # what a search compares
     radius: Float[AnyArray, "*b"] = quantity("length")
     code: Embedding = quantity("record")
     sight: Sight | None = quantity("record", default=None)
+
+    def full(self) -> Surface:
+        """All of its points. Raises ValueError where it was kept for a search alone."""
+        if self.whole is None:
+            raise ValueError("registration got objects kept for a search alone; needed them as prepared")
+        return self.whole
 
 
 @pytree
@@ -82,6 +90,11 @@ def _alignable(batch: LocalBatch, search: SurfaceSearch) -> AlignableObject:
     return jax.lax.map(one, batch)
 
 
+def searched(o: AlignableObject) -> AlignableObject:
+    """The object without what no search reads: two fifths of its memory, and as much again for its anchors."""
+    return dataclasses.replace(o, whole=None, code=dataclasses.replace(o.code, anchors=()))
+
+
 def search_poses(
     source: AlignableObject,
     target: AlignableObject,
@@ -96,6 +109,7 @@ def search_poses(
     where an object is part of several.
     """
     one_call = partial(_search_poses, search=search, motion=motion)
+    source, target = searched(source), searched(target)
     if rows is None:
         return chunked(one_call, PAIRS_A_CALL, (source, target, stayed))
     return chunked_at(

@@ -113,7 +113,7 @@ def refine_pair(
     radius = target.radius
     source, target = rescale(source, 1 / radius), rescale(target, 1 / radius)
     starts, stayed = scaled_pose(candidates, 1 / radius), scaled_pose(stayed, 1 / radius)
-    s, t = thinned(source.whole, settings.points), thinned(target.whole, settings.points)
+    s, t = thinned(source.full(), settings.points), thinned(target.full(), settings.points)
     poses = refined(starts, stayed, s, t, settings, motion)
     misfits = jax.vmap(lambda T: misfit(T, s, t, truncations(settings)))(poses)
     costs = misfits + height_cost(poses, stayed, settings.search, motion)
@@ -178,7 +178,7 @@ def prior_cost(
     weight = settings.search.field_weight
     if not weight:
         return jnp.zeros_like(costs)
-    clouds = tuple(thinned(o.whole, settings.field_points).sampled for o in objects)
+    clouds = tuple(thinned(o.full(), settings.field_points).sampled for o in objects)
     codes = objects[0].code, objects[1].code
 
     def off_of(k: Array) -> Float[Array, ""]:
@@ -234,7 +234,7 @@ def polished(
     motion: MotionModel,
 ) -> jaxlie.SE3:
     """The pose aligned with more points and a short reach; as it was if that makes it fit worse."""
-    source, target = (thinned(o.whole, settings.polish_points) for o in objects)
+    source, target = (thinned(o.full(), settings.polish_points) for o in objects)
     reach = (settings.last_reach, settings.polish_reach)
     finer = align(T, source, target, reach, settings.polish_steps, motion)
     fit = misfit(finer, source, target, truncations(settings))

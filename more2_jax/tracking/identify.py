@@ -49,6 +49,10 @@ class Identified:
         None  # the pairs that surfaces were compared of, for registration to go on with
     )
 
+    def without_seen(self) -> Identified:
+        """What registration needs to know: no longer what scans show to be empty."""
+        return self if self.aligned is None else replace(self, aligned=replace(self.aligned, seen=None))
+
     def without_pairs(self) -> Identified:
         """What is left to know once all are registered; the pairs are much of what a scene takes of memory."""
         return replace(self, aligned=None)

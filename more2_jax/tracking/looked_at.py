@@ -6,7 +6,7 @@ the paper, which takes every scan to be complete.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from functools import partial
 
 import numpy as np
@@ -35,9 +35,12 @@ def not_looked_at(
         return ()
     if not len(missing):
         return ()
-    room = apply_pose(T_scene_scan, np.concatenate([scan.background, *(i.points for i in scan.instances)]))
+    clouds = (scan.background, *(i.points for i in scan.instances))
+    there = (apply_pose(T_scene_scan, points) for points in clouds)
     share = (
-        partial(looked_at_upright, room=Columns(room)) if upright else partial(looked_at, room=KDTree(room))
+        partial(looked_at_upright, room=Columns(there))
+        if upright
+        else partial(looked_at, room=KDTree(np.concatenate(list(there))))
     )
     return tuple(objects[k].id for k in missing if share(last_place(objects[k])) < LOOKED_AT)
 
@@ -54,13 +57,16 @@ def looked_at_upright(place: Points, room: Columns) -> float:
 
 
 class Columns:
-    """The lowest point of a scan in every column, z up."""
+    """The lowest point of a scan in every column, z up. Its clouds are looked at one by one."""
 
-    def __init__(self, points: Points) -> None:
-        cell = _columns(points)
-        order = np.lexsort((points[:, 2], cell[:, 1], cell[:, 0]))
-        first = order[np.r_[True, (np.diff(cell[order], axis=0) != 0).any(axis=1)]]
-        self._lowest = dict(zip(map(tuple, cell[first].tolist()), points[first, 2].tolist(), strict=True))
+    def __init__(self, clouds: Iterable[Points]) -> None:
+        self._lowest: dict[tuple[int, ...], float] = {}
+        for points in (c for c in clouds if len(c)):
+            cell = _columns(points)
+            order = np.lexsort((points[:, 2], cell[:, 1], cell[:, 0]))
+            first = order[np.r_[True, (np.diff(cell[order], axis=0) != 0).any(axis=1)]]
+            for column, z in zip(map(tuple, cell[first].tolist()), points[first, 2].tolist(), strict=True):
+                self._lowest[column] = min(z, self._lowest.get(column, np.inf))
 
     def lowest_m(self, place: Points) -> Float[np.ndarray, " c"]:
         """Of every column that holds a point of a place, the height of the scan's lowest; infinite without any."""

@@ -8,18 +8,19 @@ they show it on another object. What is no object comes back if they show the ob
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy.spatial import KDTree
 
-from more2_jax.geometry.poses import Points, Pose, apply_pose
+from more2_jax.geometry.near_points import NearPoints
+from more2_jax.geometry.poses import Points, apply_pose
 from more2_jax.geometry.room_planes import on_planes, room_planes, within
 from more2_jax.tracking.objects import accumulated
 from more2_jax.tracking.split_masks import reach_m
-from more2_jax.types import Repair, SceneObject
+from more2_jax.types import Observation, Repair, SceneObject
 
 Rows = Bool[np.ndarray, " n"]
 Distances = Float[np.ndarray, " n"]
@@ -38,16 +39,35 @@ BESIDE_M = 0.15  # of what may come back: points that tell how it faces
 
 @dataclass(frozen=True, kw_only=True)
 class View:
-    """One object as one scan shows it, and as the other scans do; in that scan's frame, meters."""
+    """One object as one scan shows it, and as the other scans do; in that scan's frame, meters.
+
+    Points are moved when they are asked for: those of all objects are not in memory twice.
+    """
 
     row: int  # of the object
-    id: str
-    scan: int
-    instance: int
-    T_ref_scan: Pose
-    own: Points
-    others: Points
+    object: SceneObject
+    seen: Observation
+    count: int  # of its own points
     reach_m: float  # so near the points of others lies what they show of the object
+
+    @property
+    def scan(self) -> int:
+        """That is looked at."""
+        return self.seen.scan
+
+    @property
+    def own(self) -> Points:
+        """What that scan shows of it."""
+        return self._there(self.object.point_scan == self.scan)
+
+    @property
+    def others(self) -> Points:
+        """What the other scans show that make up its shape."""
+        shape = np.isin(self.object.point_scan, [s.scan for s in accumulated(self.object)])
+        return self._there(shape & (self.object.point_scan != self.scan))
+
+    def _there(self, rows: Rows) -> Points:
+        return apply_pose(np.linalg.inv(self.seen.T_ref_scan), self.object.points[rows])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,12 +84,12 @@ class Border:
         """As scan `scan` led to it."""
         v, count = self.view, len(self.points)
         return Repair(
-            object=v.id,
-            instances=(v.instance,) if v.scan == scan else (),
+            object=v.object.id,
+            instances=(v.seen.instance,) if v.scan == scan else (),
             dropped=count if self.neighbor else 0,
             neighbor=self.neighbor,
             regained=0 if self.neighbor else count,
-            points=len(v.own),
+            points=v.count,
             share=self.sure,
         )
 
@@ -106,19 +126,9 @@ def views_of(objects: Sequence[SceneObject], pairs: set[tuple[int, int]], scan: 
     for k in sorted(row for s, row in pairs if s == scan):
         o = objects[k]
         seen = next(s for s in o.observations if s.scan == scan)
-        shape = np.isin(o.point_scan, [s.scan for s in accumulated(o)])
-        there = apply_pose(np.linalg.inv(seen.T_ref_scan), o.points)
-        others = there[shape & (o.point_scan != scan)]
-        yield View(
-            row=k,
-            id=o.id,
-            scan=scan,
-            instance=seen.instance,
-            T_ref_scan=seen.T_ref_scan,
-            own=there[o.point_scan == scan],
-            others=others,
-            reach_m=reach_m(others),
-        )
+        count = int((o.point_scan == scan).sum())
+        view = View(row=k, object=o, seen=seen, count=count, reach_m=0.0)
+        yield dataclasses.replace(view, reach_m=reach_m(view.others))
 
 
 # --- what goes ----------------------------------------------------------------------------------------------
@@ -128,13 +138,14 @@ def lost_to_neighbors(views: Sequence[View]) -> list[Border]:
     """Points that the other scans do not show on their object, but on another one that goes on beside them."""
     borders, meeting = [], boxes_meet(views)
     for v, met in zip(views, meeting, strict=True):
-        free = off(v.own, v.others, v.reach_m) > v.reach_m
+        own = v.own
+        free = off(own, v.others, v.reach_m) > v.reach_m
         lost = list[Border]()
         for w in (w for w, m in zip(views, met, strict=True) if m and w is not v):
-            if (b := lost_to(v, free, w)) is not None:
+            if (b := lost_to(v, own, free, w)) is not None:
                 lost.append(b)
                 free &= ~b.rows
-        if sum(len(b.points) for b in lost) <= MOST_DROPPED * len(v.own):
+        if sum(len(b.points) for b in lost) <= MOST_DROPPED * len(own):
             borders += lost
     return borders
 
@@ -143,28 +154,34 @@ def boxes_meet(views: Sequence[View]) -> Bool[np.ndarray, "v v"]:
     """Whether the mask of one view (row) may have points within reach of what the others show of another (column)."""
     if not views:
         return np.zeros((0, 0), bool)
-    low, high = (np.stack([f(v.own, axis=0) for v in views])[:, None] for f in (np.min, np.max))
-    there, beyond = (np.stack([f(v.others, axis=0) for v in views]) for f in (np.min, np.max))
+    low, high = (x[:, None] for x in boxes(v.own for v in views))
+    there, beyond = boxes(v.others for v in views)
     reach = np.array([v.reach_m for v in views])[:, None]
     return np.all((low <= beyond + reach) & (high >= there - reach), axis=-1)
 
 
-def lost_to(v: View, free: Rows, w: View) -> Border | None:
-    """Which of the `free` points of a mask are those of one neighbor; None of none.
+def boxes(clouds: Iterable[Points]) -> tuple[Float[np.ndarray, "v 3"], Float[np.ndarray, "v 3"]]:
+    """The lowest and highest corners of clouds; one of them is in memory at a time."""
+    low, high = zip(*((c.min(axis=0), c.max(axis=0)) for c in clouds), strict=True)
+    return np.stack(low), np.stack(high)
+
+
+def lost_to(v: View, own: Points, free: Rows, w: View) -> Border | None:
+    """Which of the `free` points of a mask (`own`) are those of one neighbor; None of none.
 
     They must go on in what the scan itself has of the neighbor: another scan's mask may be the one that is wrong.
     """
     distance = np.full(len(free), np.inf)
-    distance[free] = off(v.own[free], w.others, w.reach_m)
+    distance[free] = off(own[free], w.others, w.reach_m)
     rows = distance <= w.reach_m
     if rows.mean() < LEAST_CHANGED or rows.all():
         return None
-    points, touching = v.own[rows], TOUCHING * spacing(v.own)
-    there, here = (np.isfinite(off(points, p, touching)).sum() for p in (w.own, v.own[~rows]))
+    points, touching = own[rows], TOUCHING * spacing(own)
+    there, here = (np.isfinite(off(points, p, touching)).sum() for p in (w.own, own[~rows]))
     if not there or there < GOES_ON * here:
         return None
     sure = float((distance[rows] <= w.reach_m / 2).mean())
-    return Border(view=v, points=points, sure=sure, neighbor=w.id, rows=rows)
+    return Border(view=v, points=points, sure=sure, neighbor=w.object.id, rows=rows)
 
 
 def spacing(points: Points) -> float:
@@ -181,13 +198,14 @@ def regained(views: Sequence[View], loose: Points, background: Points) -> list[B
     `loose`: all points of the scan that are no object's. Floor and walls, sought in the `background`, stay there.
     """
     few = background[:: max(1, -(-len(background) // THINNED))]
-    room = np.concatenate([few, *(v.own for v in views)])
+    room = NearPoints(np.concatenate([few, *(v.own for v in views)]))
     nearest, owner = np.full(len(loose), np.inf), np.full(len(loose), -1)
     for n, v in enumerate(views):
-        distance = off(loose, v.others, v.reach_m)
+        own, others = v.own, v.others
+        distance = off(loose, others, v.reach_m)
         rows = np.flatnonzero(distance < nearest)
-        among = np.concatenate([v.own, within(KDTree(v.others), loose, v.reach_m + BESIDE_M)])
-        planes = room_planes(np.concatenate([v.own, v.others]), few, room) if len(rows) else []
+        among = np.concatenate([own, within(KDTree(others), loose, v.reach_m + BESIDE_M)])
+        planes = room_planes(np.concatenate([own, others]), few, room) if len(rows) else []
         rows = rows[~on_planes(loose[rows], planes, among)[0]]
         nearest[rows], owner[rows] = distance[rows], n
     return [
@@ -195,10 +213,10 @@ def regained(views: Sequence[View], loose: Points, background: Points) -> list[B
             view=v,
             points=loose[rows],
             sure=float((nearest[rows] <= v.reach_m / 2).mean()),
-            rows=np.zeros(len(v.own), bool),
+            rows=np.zeros(v.count, bool),
         )
         for n, v in enumerate(views)
-        if (rows := owner == n).sum() >= LEAST_CHANGED * len(v.own)
+        if (rows := owner == n).sum() >= LEAST_CHANGED * v.count
     ]
 
 
@@ -223,7 +241,7 @@ def with_borders(objects: Sequence[SceneObject], borders: Sequence[Border]) -> l
         for b in own:
             kept[np.flatnonzero(o.point_scan == b.view.scan)[b.rows]] = False
         more = [b for b in own if b.neighbor is None]
-        points = [apply_pose(b.view.T_ref_scan, b.points) for b in more]
+        points = [apply_pose(b.view.seen.T_ref_scan, b.points) for b in more]
         normals = (
             None if o.normals is None else np.concatenate([o.normals[kept], *map(np.zeros_like, points)])
         )

@@ -95,8 +95,8 @@ def accumulated_points(o: SceneObject) -> Points:
 
 def accumulated_normals(o: SceneObject) -> Points | None:
     """The normals of the accumulated points; zeros where not known, None where the object has none."""
-    if o.normals is None:
-        return None
+    if o.normals is None or all(seen.accumulated for seen in o.observations):
+        return o.normals
     return o.normals[np.isin(o.point_scan, [seen.scan for seen in accumulated(o)])]
 
 

@@ -3,24 +3,36 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import lru_cache, partial
 
 import jax
 import numpy as np
 from jaxtyping import Float
 
-from more2_jax.config import EvidenceMatcher, SceneConfig
+from more2_jax.config import EvidenceMatcher, SceneConfig, SurfaceRegistration
 from more2_jax.geometry.poses import Points, Pose, local_poses
 from more2_jax.geometry.transform import transform
 from more2_jax.network.prior import Prior
 from more2_jax.registration.pair_batch import PairBatch, local_batch, pair_up
+from more2_jax.registration.pose_costs import asks_sensors
 from more2_jax.registration.register_pairs import register
 from more2_jax.tracking.identify import Found, Identified
-from more2_jax.tracking.objects import accumulated_normals, accumulated_points, observation_in, place_of
+from more2_jax.tracking.object_views import Views
+from more2_jax.tracking.objects import (
+    accumulated_normals,
+    accumulated_points,
+    observation_in,
+    place_of,
+    seen_again,
+)
 from more2_jax.tracking.scan_frame import settled_frame
 from more2_jax.types import Frame, Instance, Observation, ObservedObject, Registration, SceneObject, Sight
 
+Sides = tuple[list[ObservedObject], list[ObservedObject]]  # objects, and instances of a new scan
+
 PAIR_MB = 2  # of a pair ready to be registered: both clouds, codes, and what sensors saw (1.2 MB)
+PAIRS_AT_ONCE = 32  # at most, whatever memory there is: more are not faster
 
 
 def known_object(
@@ -30,21 +42,26 @@ def known_object(
 
     All seen so far where it last stood, or (`accumulate_target` False) the reference observation.
     """
-    if config.accumulate_target:
-        points, normals = accumulated_points(o), accumulated_normals(o)
-        T_scene_ref = place_of(o.observations[-1])
-    else:
-        reference = observation_in(o, o.reference_scan)
-        if reference is None:
-            raise ValueError(
-                f"{o.id} has no observation in its reference scan {o.reference_scan}; needed one"
-            )
-        rows, T_scene_ref = o.point_scan == reference.scan, place_of(reference)
+    points, normals, T_scene_ref = accumulated_points(o), accumulated_normals(o), compared_at(o, config)
+    if not config.accumulate_target:
+        rows = o.point_scan == o.reference_scan
         points, normals = o.points[rows], None if o.normals is None else o.normals[rows]
     own = ObservedObject(
         points=points, embedding=o.embedding, color=o.color, sight=sight, normals=normals, around=around
     )
+    if np.array_equal(T_scene_ref, np.eye(4)):
+        return own, T_scene_ref  # no copy of what did not move since it was first seen
     return transform(own, T_scene_ref), np.linalg.inv(T_scene_ref)
+
+
+def compared_at(o: SceneObject, config: SceneConfig) -> Pose:
+    """T_scene_ref of an object as a new scan is compared with it. Raises ValueError without a reference observation."""
+    if config.accumulate_target:
+        return place_of(o.observations[-1])
+    reference = observation_in(o, o.reference_scan)
+    if reference is None:
+        raise ValueError(f"{o.id} has no observation in its reference scan {o.reference_scan}; needed one")
+    return place_of(reference)
 
 
 def pairs_found(
@@ -56,7 +73,7 @@ def pairs_found(
     """The pairs of a scan to register, with the poses that matching found of them; of those `found`, by default all."""
     found, T = identified.found if found is None else found, identified.frame.T_scene_scan
     if identified.aligned is not None:
-        pairs = identified.aligned.take([(f.object, f.instance) for f in found])
+        pairs = identified.aligned.take([(f.object, f.instance) for f in found], (new, old))
         return with_frame(pairs, T)
     source, target = (
         local_batch(side) for side in ([new[f.instance] for f in found], [old[f.object] for f in found])
@@ -73,9 +90,8 @@ def with_frame(pairs: PairBatch, T_scene_scan: Pose) -> PairBatch:
 
 def relocalize(
     prior: Prior,
-    objects: Sequence[SceneObject],
+    views: Views,
     old: Sequence[tuple[ObservedObject, Pose]],
-    instances: Sequence[Instance],
     new: Sequence[ObservedObject],
     identified: Identified,
     scan: int,
@@ -83,19 +99,30 @@ def relocalize(
 ) -> tuple[list[Observation], Frame]:
     """Registers all that was found, and settles the frame of the scan by what stayed in it: an observation each.
 
-    If that changes the frame, the poses are refined once more: "it did not move" is another pose then.
+    `views`: the objects and the scan's instances, and what sensors saw of them. If the frame changes by that, all poses
+    are refined once more: "it did not move" is another pose then.
     """
     found, frame = identified.found, identified.frame
     if not found:
         return [], frame
-    result, T_scene_scan = registered(prior, identified, old, new, config, frame)
+    known = [o for o, _ in old]
+    # Asked twice where the frame changes: what few pairs show is kept.
+    sides = lru_cache(maxsize=1)(partial(with_views, known, new, config, views))
+    result, T_scene_scan = registered(prior, identified, sides, config, frame)
     if isinstance(config.matching, EvidenceMatcher):
-        frame = settled(objects, old, found, T_scene_scan, result, frame, new, config)
+        frame = settled(views.objects, old, found, T_scene_scan, result, frame, new, config)
         if not np.array_equal(frame.T_scene_scan, identified.frame.T_scene_scan):
-            result, T_scene_scan = registered(prior, identified, old, new, config, frame)
+            result, T_scene_scan = registered(prior, identified, sides, config, frame)
     return [
         observation(
-            result, n, old[f.object][1] @ T_scene_scan[n], f, scan, instances[f.instance].id, frame, config
+            result,
+            n,
+            old[f.object][1] @ T_scene_scan[n],
+            f,
+            scan,
+            views.instances[f.instance].id,
+            frame,
+            config,
         )
         for n, f in enumerate(found)
     ], frame
@@ -104,24 +131,45 @@ def relocalize(
 def registered(
     prior: Prior,
     identified: Identified,
-    old: Sequence[tuple[ObservedObject, Pose]],
-    new: Sequence[ObservedObject],
+    sides: Callable[[tuple[Found, ...]], Sides],
     config: SceneConfig,
     frame: Frame,
 ) -> tuple[Registration, Float[np.ndarray, "p 4 4"]]:
     """All that was found registered, `frame` being the scan's; and the poses of instances in the scene's frame.
 
-    In batches of as many pairs as `config.memory_mb` holds.
+    In batches of as many pairs as `config.memory_mb` holds. `sides`: objects and instances, some with what sensors saw
+    of them.
     """
-    known, found, parts = [o for o, _ in old], identified.found, list[tuple[Registration, np.ndarray]]()
-    at_once = max(1, config.memory_mb // PAIR_MB)
+    found, parts = identified.found, list[tuple[Registration, np.ndarray]]()
+    at_once = min(PAIRS_AT_ONCE, max(1, config.memory_mb // PAIR_MB))
     for start in range(0, len(found), at_once):
-        pairs = pairs_found(identified, known, new, found[start : start + at_once])
+        some = found[start : start + at_once]
+        pairs = pairs_found(identified, *sides(some), some)
         if frame is not identified.frame:
             pairs = with_frame(pairs, frame.T_scene_scan)
         result = jax.device_get(register(prior, pairs, config.registration, config.motion))
         parts.append((result, pairs.to_world(result.T_target_source)))
     return parts[0] if len(parts) == 1 else jax.tree.map(lambda *x: np.concatenate(x), *parts)
+
+
+def with_views(
+    old: Sequence[ObservedObject],
+    new: Sequence[ObservedObject],
+    config: SceneConfig,
+    views: Views,
+    found: Sequence[Found],
+) -> Sides:
+    """The objects and instances, those of `found` with what sensors saw of them where registration asks for it."""
+    old, new, method = list(old), list(new), config.registration
+    if not isinstance(method, SurfaceRegistration) or not asks_sensors(method.search, config.motion):
+        return old, new
+    rows, columns = [f.object for f in found], [f.instance for f in found]
+    for k, sight in zip(rows, views.of_objects(rows), strict=True):
+        there = None if sight is None else transform(sight, compared_at(views.objects[k], config))
+        old[k] = dataclasses.replace(old[k], sight=there)
+    for i, sight in zip(columns, views.of_instances(columns), strict=True):
+        new[i] = dataclasses.replace(new[i], sight=sight)
+    return old, new
 
 
 def settled(
@@ -180,3 +228,16 @@ def observation(
         misfit=misfit,
         accumulated=misfit <= config.accumulate_misfit,
     )
+
+
+def with_observations(
+    objects: Sequence[SceneObject],
+    instances: Sequence[Instance],
+    found: Sequence[Found],
+    seen: Sequence[Observation],
+) -> list[SceneObject]:
+    """The objects, those found with what the scan shows of them."""
+    known = list(objects)
+    for f, observation in zip(found, seen, strict=True):
+        known[f.object] = seen_again(known[f.object], instances[f.instance], observation)
+    return known

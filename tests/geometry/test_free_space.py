@@ -33,7 +33,7 @@ from more2_jax.scene import add_scan, start_scene
 from more2_jax.storage.scene_folder import load_scene, save_scene
 from more2_jax.tracking import relocalize
 from more2_jax.tracking.accumulated import accumulated_object
-from more2_jax.tracking.object_views import object_sights
+from more2_jax.tracking.object_views import Views
 from more2_jax.tracking.objects import seen_again
 from more2_jax.types import Instance, Scan
 
@@ -251,12 +251,12 @@ def test_an_objects_views_are_of_all_that_make_up_its_shape(tiny_prior):
     seen = dataclasses.replace(scene.objects[0].observations[0], scan=1, T_ref_scan=T)
     twice = seen_again(scene.objects[0], scans[1].instances[0], seen)
     records = (*scene.scans, dataclasses.replace(scene.scans[0], index=1))
-    (both,) = object_sights([twice], records)
+    (both,) = Views([twice], records).of_objects()
     np.testing.assert_allclose(both.eye, [[0.0, -4.0, 1.5], [-0.5, -4.0, 1.5]])
     doubted = seen_again(
         scene.objects[0], scans[1].instances[0], dataclasses.replace(seen, accumulated=False)
     )
-    (one,) = object_sights([doubted], records)
+    (one,) = Views([doubted], records).of_objects()
     np.testing.assert_allclose(one.eye, sensors)
     count = len(doubted.points) // 2
     np.testing.assert_allclose(

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from more2_jax.geometry.free_space import axes_toward
-from more2_jax.geometry.near_points import CELL_M, RADIUS_M, NearPoints
+from more2_jax.geometry.near_points import CELL_M, RADIUS_M, NearClouds, NearPoints
 
 POINTS = np.random.default_rng(0).uniform(-20, 20, (20_000, 3))
 
@@ -52,3 +52,21 @@ def test_of_no_points_none_are_near():
     near = NearPoints(np.zeros((0, 3)))
     assert near.points_of(near.cells_around(np.zeros(3), 5.0)).shape == (0, 3)
     assert near.around_box(np.zeros(3), np.ones(3)).shape == (0, 3)
+
+
+def test_clouds_near_some_places_show_there_what_all_clouds_show():
+    """A building of 400 balls: what is put in order is near the places, and all that is near is."""
+    rng = np.random.default_rng(4)
+    middles = np.stack([*np.meshgrid(*[np.arange(20) * 5.0] * 2), np.zeros((20, 20))], axis=-1).reshape(-1, 3)
+    clouds = [m + rng.normal(0, 0.7, (50, 3)) for m in middles] + [np.zeros((0, 3))]
+    rest = rng.uniform(0, 95, (300, 3))
+    whole = NearPoints(np.concatenate([*clouds, rest]))
+    building = NearClouds([lambda c=c: c for c in clouds], rest)
+    for places in ([middles[0]], [middles[0]], [middles[45], middles[47]], [np.array([-500.0, 0, 0])]):
+        some = building.near(places, 8.0)
+        for place in places:
+            here, expected = (x.points_of(x.cells_around(place, 8.0)) for x in (some, whole))
+            assert len(here) == len(expected) and missed(expected, here) == set()
+        everything = some.around_box(np.full(3, -1e3), np.full(3, 1e3))
+        assert len(rest) <= len(everything) < 60 * 50 + len(rest)
+    assert building.near(places, 8.0) is some

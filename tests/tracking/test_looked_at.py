@@ -91,9 +91,9 @@ def test_the_last_place_is_looked_for_not_the_first():
 
 def test_shares_are_of_the_place():
     whole = floor([0, 0], [4, 3])
-    assert looked_at_upright(BOX, Columns(whole)) == 1.0 == looked_at(BOX, KDTree(BOX + 0.01))
+    assert looked_at_upright(BOX, Columns([whole])) == 1.0 == looked_at(BOX, KDTree(BOX + 0.01))
     away = whole + [50, 0, 0]
-    assert looked_at_upright(BOX, Columns(away)) == 0.0 == looked_at(BOX, KDTree(away))
+    assert looked_at_upright(BOX, Columns([away])) == 0.0 == looked_at(BOX, KDTree(away))
 
 
 def test_an_object_not_looked_for_is_compared_with_the_scan_that_saw_it_last():
