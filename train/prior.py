@@ -28,7 +28,16 @@ from more2_jax.config import load_config
 from more2_jax.network.prior import Prior, save_prior
 from train.run.batches import Batches, batches_of
 from train.run.checkpoints import keep, open_checkpoints, resume
-from train.run.devices import agreed, connect, device_a_core, device_mesh, everywhere, here, is_first
+from train.run.devices import (
+    agreed,
+    connect,
+    device_a_core,
+    device_mesh,
+    everywhere,
+    here,
+    is_first,
+    wide_vectors,
+)
 from train.run.journal import Journal
 from train.run.memory import keep_freed_memory, memory_bytes
 from train.run.pictures import held_out
@@ -90,6 +99,7 @@ def main(
     deadline = time.monotonic() + 60 * minutes
     keep_freed_memory()
     settings, name = load_config(config, TrainingRun), name or config.stem
+    wide_vectors()
     device_a_core(settings.training.batch, coordinator)
     connect(coordinator, processes, process)
     first = started_warm(settings.model, warm_start, name) if warm_start else None

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 from contextlib import suppress
+from importlib.metadata import version
 from typing import TypeVar
 
 import jax
@@ -17,6 +18,9 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 T = TypeVar("T")
 ROWS = "rows"  # of a batch: the one axis of the mesh
 IN_ENVIRONMENT = ("JAX_COORDINATOR_ADDRESS", "COORDINATOR_ADDRESS")
+# Loops in registers of 512 bits, where a CPU has such: 4 % of a step (docs/developing/notebook/speed_layers.md). XLA
+# stops at flags that it does not know: only versions that have it are told.
+VECTOR_WIDTH, KNOWS_VECTOR_WIDTH = "xla_cpu_prefer_vector_width", ("0.10.",)
 CHOSEN_BY_FLAG = "xla_force_host_platform_device_count"
 
 
@@ -35,6 +39,13 @@ def device_a_core(batch: int, coordinator: str = "") -> None:
     if not (among_several or chosen_by_user()):
         with suppress(RuntimeError):  # what JAX says when it is too late
             jax.config.update("jax_num_cpu_devices", shares(batch, cores()))
+
+
+def wide_vectors() -> None:
+    """Has XLA's programs for CPUs use the widest registers; before anything asks JAX for a device."""
+    given = os.environ.get("XLA_FLAGS", "")
+    if version("jaxlib").startswith(KNOWS_VECTOR_WIDTH) and VECTOR_WIDTH not in given:
+        os.environ["XLA_FLAGS"] = f"{given} --{VECTOR_WIDTH}=512".strip()
 
 
 def chosen_by_user() -> bool:
