@@ -257,4 +257,4 @@ def _marching_cubes(found: GridField, embedding: Embedding) -> Mesh:
     vertices, faces, _, _ = marching_cubes(padded, 0.0, gradient_direction="descent")
     offsets = lattice.at(vertices - 1)
     placed = offsets * float(embedding.scale) + embedding.scan_center()
-    return Mesh(vertices=placed.astype(np.float64), faces=faces.astype(np.int64))
+    return Mesh(vertices=placed.astype(np.float64), faces=faces.astype(np.int32))

@@ -93,4 +93,4 @@ def placed_mesh(
     steps = np.asarray(surface.vertices[: int(surface.vertex_count)], np.float64)
     offsets = steps * (2 * half_width / config.resolution) - half_width
     vertices = offsets * float(embedding.scale) + embedding.scan_center()
-    return Mesh(vertices=vertices, faces=faces[faces[:, 0] >= 0].astype(np.int64))
+    return Mesh(vertices=vertices, faces=faces[faces[:, 0] >= 0].astype(np.int32))
