@@ -8,16 +8,18 @@ they show it on another object. What is no object comes back if they show the ob
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy.spatial import KDTree
 
-from more2_jax.geometry.near_points import NearPoints
+from more2_jax.geometry.near_points import NearClouds, NearPoints, ball_around
 from more2_jax.geometry.poses import Points, apply_pose
-from more2_jax.geometry.room_planes import on_planes, room_planes, within
+from more2_jax.geometry.room_planes import AROUND_M, BOX_SLACK, on_planes, room_planes, within
 from more2_jax.tracking.objects import accumulated
 from more2_jax.tracking.split_masks import reach_m
 from more2_jax.types import Observation, Repair, SceneObject
@@ -34,6 +36,7 @@ GOES_ON = (
     0.3  # as many points must touch the neighbor's own, as a share of those that touch the rest of the mask
 )
 THINNED = 20_000  # points of a background, at even steps, that floor and walls are sought in
+TOGETHER = 32  # masks whose surroundings are put in order at once
 BESIDE_M = 0.15  # of what may come back: points that tell how it faces
 
 
@@ -198,9 +201,8 @@ def regained(views: Sequence[View], loose: Points, background: Points) -> list[B
     `loose`: all points of the scan that are no object's. Floor and walls, sought in the `background`, stay there.
     """
     few = background[:: max(1, -(-len(background) // THINNED))]
-    room = NearPoints(np.concatenate([few, *(v.own for v in views)]))
     nearest, owner = np.full(len(loose), np.inf), np.full(len(loose), -1)
-    for n, v in enumerate(views):
+    for n, (v, room) in enumerate(zip(views, rooms_about(views, few), strict=True)):
         own, others = v.own, v.others
         distance = off(loose, others, v.reach_m)
         rows = np.flatnonzero(distance < nearest)
@@ -218,6 +220,15 @@ def regained(views: Sequence[View], loose: Points, background: Points) -> list[B
         for n, v in enumerate(views)
         if (rows := owner == n).sum() >= LEAST_CHANGED * v.count
     ]
+
+
+def rooms_about(views: Sequence[View], background: Points) -> Iterator[NearPoints]:
+    """For every view what its scan shows around: all masks near it and near those next in line, and the background."""
+    clouds = NearClouds([partial(getattr, v, "own") for v in views], background)
+    for start in range(0, len(views), TOGETHER):
+        balls = [ball_around(np.concatenate([v.own, v.others])) for v in views[start : start + TOGETHER]]
+        reach_m = max(radius for _, radius in balls) + 2 * BOX_SLACK * AROUND_M
+        yield from itertools.repeat(clouds.near([center for center, _ in balls], reach_m), len(balls))
 
 
 def off(points: Points, cloud: Points, reach_m: float) -> Distances:

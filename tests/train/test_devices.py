@@ -30,6 +30,8 @@ def test_wide_registers_are_asked_for_unless_the_user_chose(monkeypatch, given, 
 
 
 def test_the_installed_version_knows_the_flag():
-    program = "from train.run.devices import wide_vectors as f; f(); import jax; print(jax.jit(lambda x: x + 1)(1))"
+    program = (
+        "from train.run.devices import wide_vectors as f; f(); import jax; print(jax.jit(lambda x: x + 1)(1))"
+    )
     told = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert told.stdout.strip() == "2"
