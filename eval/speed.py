@@ -31,7 +31,7 @@ from more2_jax.geometry.points import farthest_points
 from more2_jax.network.decoder import Decoder
 from more2_jax.network.prior import Prior, encode_ordered, init_prior
 from more2_jax.network.row_map import in_blocks, in_turn
-from train.run.devices import by_rows, cores, device_a_core, device_mesh, everywhere, wide_vectors
+from train.run.devices import by_rows, cores, device_a_core, device_mesh, everywhere
 from train.run.memory import GLIBC_KEEPS_MEMORY, keep_freed_memory
 from train.run.program import run
 from train.run.settings import TrainingRun
@@ -62,7 +62,6 @@ def main(
         repeats: rounds; every competitor once a round.
     """
     keep_freed_memory()  # as training does, and so is
-    wide_vectors()
     device_a_core(clouds)
     quiet = published_layers(load_config(config, TrainingRun).model)
     batch = clouds_and_queries(clouds, points, queries)

@@ -36,7 +36,6 @@ from train.run.devices import (
     everywhere,
     here,
     is_first,
-    wide_vectors,
 )
 from train.run.journal import Journal
 from train.run.memory import keep_freed_memory, memory_bytes
@@ -99,7 +98,6 @@ def main(
     deadline = time.monotonic() + 60 * minutes
     keep_freed_memory()
     settings, name = load_config(config, TrainingRun), name or config.stem
-    wide_vectors()
     device_a_core(settings.training.batch, coordinator)
     connect(coordinator, processes, process)
     first = started_warm(settings.model, warm_start, name) if warm_start else None

@@ -138,8 +138,7 @@ def align_candidates(
     worth = proposed(old, new, matcher, T if place is None else place)
     rows = worth.pairs[:, ::-1]
     few = max(len(old), len(new)) <= OBJECTS_AT_ONCE
-    instances, of_new = prepared(new, matcher.search, motion, few)
-    objects, of_old = prepared(old, matcher.search, motion, few)
+    (instances, of_new), (objects, of_old) = (prepared(x, matcher.search, motion, few) for x in (new, old))
     ready, ends = (instances, objects), (of_old[rows[:, 1]], of_new[rows[:, 0]])
     stayed = local_poses(np.broadcast_to(T, (len(rows), 4, 4)), *ends)
     found = search_poses(*ready, stayed, matcher.search, motion, rows)

@@ -32,9 +32,11 @@ def shares(batch: int, cores: int) -> int:
 def device_a_core(batch: int, coordinator: str = "") -> None:
     """Divides the CPU into devices that share `batch`; before anything else asks JAX for a device.
 
-    Programs on accelerators do not run there. Nothing changes for a process among several, which may share their
-    cores; where XLA_FLAGS or JAX_NUM_CPU_DEVICES have chosen; and where JAX has its devices already.
+    Their programs use wide registers (`wide_vectors`); those on accelerators do not run there. The devices stay as they
+    are for a process among several, which may share their cores; where XLA_FLAGS or JAX_NUM_CPU_DEVICES have chosen;
+    and where JAX has its devices already.
     """
+    wide_vectors()
     among_several = coordinator or any(os.environ.get(name) for name in IN_ENVIRONMENT)
     if not (among_several or chosen_by_user()):
         with suppress(RuntimeError):  # what JAX says when it is too late
