@@ -13,6 +13,7 @@ from scipy.special import expit
 from more2_jax.config import EvidenceMatcher, SurfaceSearch, preset
 from more2_jax.geometry.point_to_plane import coarsened, whole_surface
 from more2_jax.geometry.poses import vertical_shift
+from more2_jax.matching import candidates
 from more2_jax.matching.assignment import (
     FARTHEST_M,
     LEAST_GAIN,
@@ -176,6 +177,26 @@ def test_in_any_orientation_the_evidence_is_that_of_the_best_pose(tiny_prior):
         for c, e in zip(sampled, codes, strict=True)
     ]
     np.testing.assert_allclose(found.off_own[0], max(own), atol=1e-3)
+
+
+@pytest.mark.parametrize("motion", ["free", "upright"])
+def test_of_many_objects_less_is_kept_and_registration_is_handed_the_same(tiny_prior, monkeypatch, motion):
+    rng = np.random.default_rng(3)
+    sizes = ([1.0, 0.5, 0.6], [0.4, 0.5, 0.9])
+    new, old = (
+        observed(
+            tiny_prior, [box(rng, np.array(size), 200) + [k, 2.0 * n, 0] for n, size in enumerate(sizes)]
+        )
+        for k in range(2)
+    )
+    matcher = EvidenceMatcher(search=SurfaceSearch(steps=4, dense=256, cells=8, free_weight=0.0))
+    few = align_candidates(tiny_prior, old, new, matcher, motion)
+    monkeypatch.setattr(candidates, "OBJECTS_AT_ONCE", 1)
+    many = align_candidates(tiny_prior, old, new, matcher, motion)
+    assert few.ready[0].whole is not None and many.ready[0].whole is None
+    pairs = [tuple(row) for row in few.rows.tolist()]
+    for x, y in zip(*(jax.tree.leaves((a.found, a.off, a.take(pairs))) for a in (few, many)), strict=True):
+        np.testing.assert_array_equal(x, y)
 
 
 def test_what_is_left_over_is_gone_unless_another_left_over_may_be_it():
