@@ -134,7 +134,7 @@ def measured(options: Settings, count: int) -> Measured:
     points = sum(len(i.points) for s in (first, second) for i in s.instances)
     watch = Watch()
     scene = start_scene(prior, first, config, progress=watch)
-    del first  # as `more2 run` reads one scan after the other
+    del first  # as `more2 run` does once a scan is added
     watch.mark("rest")
     scene = add_scan(prior, scene, second, config, progress=watch)
     del second

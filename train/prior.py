@@ -28,15 +28,7 @@ from more2_jax.config import load_config
 from more2_jax.network.prior import Prior, save_prior
 from train.run.batches import Batches, batches_of
 from train.run.checkpoints import keep, open_checkpoints, resume
-from train.run.devices import (
-    agreed,
-    connect,
-    device_a_core,
-    device_mesh,
-    everywhere,
-    here,
-    is_first,
-)
+from train.run.devices import agreed, connect, device_a_core, device_mesh, everywhere, here, is_first
 from train.run.journal import Journal
 from train.run.memory import keep_freed_memory, memory_bytes
 from train.run.pictures import held_out

@@ -16,8 +16,7 @@ RADIUS_M = CELL_M * np.sqrt(3) / 2  # of the ball that holds a cell
 # Makes one number of a cell; a million cells either way along each axis
 SIDES = np.array([1 << 42, 1 << 21, 1])
 
-
-Made = Callable[[], Points]  # a cloud, when it is needed
+Made = Callable[[], Points]  # makes a cloud when it is needed
 
 
 class NearPoints:
@@ -74,7 +73,7 @@ class NearPoints:
 class NearClouds:
     """Clouds of a large scan, of which those near some places are put in order together.
 
-    What was put in order last is kept: rooms of one size are asked the same again and again.
+    What was put in order last is kept: for places in a single room it is always the same.
     """
 
     def __init__(self, clouds: Sequence[Made], rest: Points) -> None:

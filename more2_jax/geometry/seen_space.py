@@ -22,7 +22,7 @@ BLOCK = 64  # columns along a side of what is searched at once, 9.6 m: a room or
 BESIDE = 2  # columns beside a block that are searched with it: a place at its border reaches so far
 BLOCKS_KEPT = 8  # of a scan, with their search trees; pairs are asked about place by place
 Block = tuple[int, int]  # its steps along x and y
-SIDES = 1 << 32  # makes one number of a column or block; more of them than a scan has along an axis
+SIDES = 1 << 32  # of a grid of columns or blocks: makes one number of two steps
 
 
 class SeenSpace:

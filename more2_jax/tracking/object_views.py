@@ -17,8 +17,6 @@ from more2_jax.types import Instance, Scan, ScanRecord, SceneObject, Sight
 
 SENSORS = 64  # of a scan that are remembered
 REACH_M = 15.0  # of things farther off, in other rooms of a building, a sensor is not asked
-
-
 NOTHING = np.zeros((0, 3))
 Rows = Sequence[int]
 
