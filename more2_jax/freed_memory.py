@@ -13,8 +13,8 @@ LARGE = 64  # objects: with fewer, what is freed is soon needed again
 def give_back(objects: int) -> None:
     """Returns what was freed, where a scene is large.
 
-    The C library keeps it otherwise, in pieces that later steps do not fit in: a quarter of what a building of 74 objects took. Does
-    nothing where that library is not glibc.
+    The C library keeps it otherwise, in pieces that later steps do not fit in: a quarter of what a building of 74
+    objects took. Does nothing where that library is not glibc.
     """
     if objects > LARGE and (library := _glibc()) is not None:
         gc.collect()
