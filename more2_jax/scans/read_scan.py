@@ -13,6 +13,7 @@ from more2_jax.geometry.up_axis import R_UP
 from more2_jax.scans.formats.registry import FORMATS, WITH_DEPTH_FRAMES
 from more2_jax.scans.geometric_segmentation import SegmentationConfig, segment_geometric
 from more2_jax.scans.labeled_cloud import CUT_WITHOUT, LabeledCloud, ReadOptions, one_line
+from more2_jax.scans.large_instances import thinned_instances
 from more2_jax.scans.normal_sides import outward
 from more2_jax.scans.predicted_masks import lay_masks
 from more2_jax.types import Instance, Scan, Skipped
@@ -50,8 +51,9 @@ def read_scan(
     `unit` is the file's: m, cm or mm. `up` names the file's up axis (x, y, z, -x, -y, -z); the scan is turned so that
     it is z. `masks` are predicted ones (`scans.predicted_masks`): those scored `min_score` or more replace the scan's
     own. `segment="geometric"` cuts a cloud without instances into planes and clusters. `depth_frames` reads the raw
-    depth of 3RScan (paper §4). Instances of fewer than `min_points` points are named in `Scan.skipped`, sizes that look
-    like another unit in `Scan.warnings`.
+    depth of 3RScan (paper §4). Instances of fewer than `min_points` points are named in `Scan.skipped`. Those of more
+    than `scans.large_instances.MOST_POINTS` are thinned to that many, evenly in space; `Scan.warnings` says so, and
+    names sizes that look like another unit.
 
     Raises ValueError, in one line, when the file is missing, unknown, damaged, has no instance property, has
     coordinates that are not finite, or no instance is left.
@@ -181,7 +183,8 @@ def scan_of(path: Path, cloud: LabeledCloud, unit: str, min_points: int) -> Scan
     sensors = np.zeros((0, 3)) if cloud.sensors is None else cloud.sensors
     background = points[cloud.instance <= 0]
     normals, turned = _outward_normals(cloud, cloud.instance, sensors)
-    kept, skipped = _instances(replace(cloud, normals=normals), cloud.instance, points, min_points)
+    whole, skipped = _instances(replace(cloud, normals=normals), cloud.instance, points, min_points)
+    kept, thinned = thinned_instances(whole)
     if not kept:
         raise ValueError(f"{path}: no instances left; {_why_none(len(background), skipped, min_points)}")
     return Scan(
@@ -191,7 +194,7 @@ def scan_of(path: Path, cloud: LabeledCloud, unit: str, min_points: int) -> Scan
         background=background,
         sensors=sensors * UNITS_M[unit],
         skipped=(*cloud.skipped, *skipped),
-        warnings=(*cloud.warnings, *turned, *_unit_warnings(kept, unit)),
+        warnings=(*cloud.warnings, *turned, *thinned, *_unit_warnings(kept, unit)),
     )
 
 
