@@ -29,6 +29,7 @@ from more2_jax.config import PresetName, preset
 from more2_jax.network.prior import load_prior
 from more2_jax.progress import Progress
 from more2_jax.scene import add_scan, reconstruct, start_scene
+from more2_jax.storage.waiting_meshes import WaitingMeshes
 from more2_jax.types import Instance, LivingScene, Scan
 from train.rooms.scene_files import read_scene
 from train.rooms.visits import FlyingScene
@@ -140,7 +141,8 @@ def measured(options: Settings, count: int) -> Measured:
     del second
     watch.mark("rest")
     if options.meshes:
-        scene = reconstruct(prior, scene, config, progress=watch)
+        with WaitingMeshes(options.out / "meshes") as keep:  # as `more2 run` does with a large scene
+            scene = reconstruct(prior, scene, config, progress=watch, keep=keep)
         watch.mark("rest")
     return Measured(
         objects=counts[0],

@@ -35,13 +35,12 @@ from more2_jax.network.prior import Prior, load_prior
 from more2_jax.scene import (
     compared_objects,
     leveled_scan,
-    rooms_of,
     start_scene,
     usable,
     without_floor_and_walls,
 )
 from more2_jax.tracking.scan_frame import common_frame
-from more2_jax.tracking.scan_height import Rooms
+from more2_jax.tracking.scan_height import Rooms, rooms_of
 from more2_jax.types import ObservedObject
 from train.run.program import run
 

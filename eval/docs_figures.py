@@ -67,6 +67,14 @@ FIGURES = {
     "right pairs": ("right pairs", ""),
     "moments": ("moments", ""),
     "right moments": ("right moments", ""),
+    "sign": ("sign", ""),
+    "error of distances": ("error of distances", ""),
+    "overlap": ("overlap", ""),
+    "orientation": ("orientation", ""),
+    "change of distances": ("change of distances", ""),
+    "change of slopes": ("change of slopes", ""),
+    "cosine of gradients": ("cosine of gradients", ""),
+    "cosine with another batch": ("cosine with another batch", ""),
     "time": ("time a scene", ""),
     "time a pair": ("time a pair", ""),
     "processor time": ("processor time a scene", ""),
@@ -75,7 +83,7 @@ FIGURES = {
 SENSE = {"higher": 1.0, "lower": -1.0}
 # What programs count, where it is not pairs.
 COUNTED = {"reconstruction": "objects", "segmentation": "objects"}
-NO_RIVALS = ("building", "survival")  # programs whose lines are not methods
+NO_RIVALS = ("bfloat16", "building", "survival")  # programs whose lines are not methods
 OURS = "ours"  # methods whose names begin so
 
 

@@ -34,8 +34,8 @@ from more2_jax.geometry.poses import apply_pose, turned
 from more2_jax.meshing.engine import meshes_of_objects
 from more2_jax.network.prior import Prior
 from more2_jax.refinement.joint_of_objects import fit_objects
-from more2_jax.scene import remembered
 from more2_jax.tracking.object_views import few_sensors
+from more2_jax.tracking.room_points import remembered
 from more2_jax.types import AccumulatedObject, Mesh, Observation
 
 

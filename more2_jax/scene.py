@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from functools import partial
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
 from more2_jax.config import EvidenceMatcher, SceneConfig
 from more2_jax.freed_memory import give_back
-from more2_jax.geometry.poses import Points, Pose, apply_pose
+from more2_jax.geometry.poses import Points, Pose
 from more2_jax.matching.color import color_of
 from more2_jax.meshing.engine import meshes_of_objects
 from more2_jax.network.embedding_batch import embed
@@ -26,7 +25,7 @@ from more2_jax.registration.pose_costs import asks_sensors
 from more2_jax.tracking.accumulated import accumulated_objects, embed_accumulated, readable, with_refined
 from more2_jax.tracking.changes import changes_between, forgotten, not_seen_in
 from more2_jax.tracking.comparison import Comparison
-from more2_jax.tracking.identify import Found, Identified, identify, with_left_over
+from more2_jax.tracking.identify import Found, Identified, chances, identify, with_left_over
 from more2_jax.tracking.joined_masks import join_parts
 from more2_jax.tracking.leveling import as_given, level_by_objects, level_of, leveled, shows_floor, tells_up
 from more2_jax.tracking.looked_at import not_looked_at
@@ -36,8 +35,8 @@ from more2_jax.tracking.object_views import Views, few_sensors
 from more2_jax.tracking.objects import SCENE_FRAME, accumulated, new_objects, next_number
 from more2_jax.tracking.regrouped import Regrouped
 from more2_jax.tracking.relocalize import known_object, relocalize, with_observations
-from more2_jax.tracking.room_points import Cleared, without_room
-from more2_jax.tracking.scan_frame import Rooms
+from more2_jax.tracking.room_points import Cleared, remembered, without_room
+from more2_jax.tracking.scan_height import rooms_of
 from more2_jax.tracking.split_masks import mend_splits
 from more2_jax.tracking.surroundings import surroundings, surroundings_of_objects
 from more2_jax.types import (
@@ -45,6 +44,7 @@ from more2_jax.types import (
     Frame,
     Instance,
     LivingScene,
+    Mesh,
     ObservedObject,
     Repair,
     Scan,
@@ -58,7 +58,6 @@ Compared = tuple[Regrouped, list[tuple[ObservedObject, Pose]], list[ObservedObje
 Mend = Callable[[Regrouped, Comparison], Regrouped | None]
 
 CLOSED_AT_ONCE = 64  # objects whose poses are refined in one call; each takes a MB
-BACKGROUND_POINTS = 20_000  # of a scan, kept for the page and for free space
 
 
 def start_scene(
@@ -188,31 +187,21 @@ def added(
     return dataclasses.replace(scene, scans=scans, objects=tuple(objects), changes=changes, timing_s=timing)
 
 
-def chances(
-    identified: Identified,
-    objects: Sequence[SceneObject],
-    fresh: Mapping[int, SceneObject],
-    config: SceneConfig,
-) -> dict[str, float]:
-    """Returns by object id the probability that it is really gone, back or new.
-
-    `fresh`: new objects by the rows of their instances.
-    """
-    gone = {objects[k].id: p for k, p in identified.gone.items()}
-    known = isinstance(config.matching, EvidenceMatcher)
-    back = {objects[f.object].id: f.score for f in identified.found if known}
-    return gone | back | {fresh[i].id: p for i, p in identified.new.items() if i in fresh}
-
-
 def reconstruct(
-    prior: Prior, scene: LivingScene, config: SceneConfig, *, progress: Watcher | None = None
+    prior: Prior,
+    scene: LivingScene,
+    config: SceneConfig,
+    *,
+    progress: Watcher | None = None,
+    keep: Callable[[Mesh], Mesh] | None = None,
 ) -> LivingScene:
     """Refines the poses of objects that were seen more than once, then extracts the mesh of every object.
 
     `pose_graph.steps` (preset `robust`) aligns all observations of an object with one another. `joint.steps` (preset
     `paper`) optimizes code and poses together (paper §3.5). An object without a code of all its observations is
     encoded anew (§3.4). Doubtful observations (`Observation.accumulated` False) are left out. Objects that have a
-    mesh are not touched: they have not changed since it was made.
+    mesh are not touched: they have not changed since it was made. Every new mesh is passed through `keep`, such as
+    `storage.waiting_meshes.WaitingMeshes`: those of a building need not all be in memory.
     """
     config, scene = settled(config, scene.upright), readable(prior, scene)
     timing, objects = dict(scene.timing_s), list(scene.objects)
@@ -220,11 +209,7 @@ def reconstruct(
     again = [k for k in todo if len(accumulated(objects[k])) > 1]
     align, fit = again if config.pose_graph.steps else [], again if config.joint.steps else []
     with staged(timing, progress, "close", len(align)):
-        for start in range(0, len(align), CLOSED_AT_ONCE):
-            some = align[start : start + CLOSED_AT_ONCE]
-            several = list(accumulated_objects(objects, some, scene.scans))
-            refined = refine_object_poses(prior, several, config)
-            objects = with_refined(objects, some, refined)
+        objects = with_poses_refined(prior, objects, align, scene.scans, config)
     anew = [] if config.accumulate_target else again
     with staged(timing, progress, "encode", len(anew)):
         objects = embed_accumulated(prior, objects, anew)
@@ -234,13 +219,29 @@ def reconstruct(
     with staged(timing, progress, "mesh", len(todo)) as advance:
         meshes = meshes_of_objects(prior, accumulated_objects(objects, todo, scene.scans), config)
         for done, (k, mesh) in enumerate(zip(todo, meshes, strict=True), start=1):
-            objects[k] = dataclasses.replace(objects[k], mesh=mesh)
+            objects[k] = dataclasses.replace(objects[k], mesh=keep(mesh) if keep and mesh else mesh)
             advance(done)
     changes = tuple(
         changes_between(objects, c.from_scan, c.to_scan, config, c.probability, not_seen_in(scene.scans))
         for c in scene.changes
     )
     return dataclasses.replace(scene, objects=tuple(objects), changes=changes, timing_s=timing)
+
+
+def with_poses_refined(
+    prior: Prior,
+    objects: list[SceneObject],
+    chosen: Sequence[int],
+    scans: Sequence[ScanRecord],
+    config: SceneConfig,
+) -> list[SceneObject]:
+    """Returns the objects, the poses of the `chosen` refined by how their observations fit one another."""
+    for start in range(0, len(chosen), CLOSED_AT_ONCE):
+        some = chosen[start : start + CLOSED_AT_ONCE]
+        refined = refine_object_poses(prior, list(accumulated_objects(objects, some, scans)), config)
+        objects = with_refined(objects, some, refined)
+        give_back(len(objects))
+    return objects
 
 
 def run_scenes(
@@ -364,12 +365,6 @@ def leveled_scan(
     return leveled(scan, T_level_scan), T_level_scan
 
 
-def rooms_of(scene: LivingScene, scan: Scan) -> Rooms:
-    """Returns the backgrounds of the scene's last scan and of a new one, both leveled."""
-    last = scene.scans[-1]
-    return Rooms(scene=apply_pose(last.frame.T_scene_scan, last.background), scan=scan.background)
-
-
 def record(
     index: int,
     scan: Scan,
@@ -392,8 +387,3 @@ def record(
         background=remembered(scan.background),
         sensors=few_sensors(scan),
     )
-
-
-def remembered(background: Float[np.ndarray, "b 3"]) -> Float[np.ndarray, "k 3"]:
-    """Returns every k-th point of the background, so that at most `BACKGROUND_POINTS` remain."""
-    return background[:: max(1, -(-len(background) // BACKGROUND_POINTS))]

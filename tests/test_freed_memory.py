@@ -31,7 +31,9 @@ print(told, before - resident(), resident() - start)
 
 def after_freeing(objects: int) -> tuple[float, float]:
     """What `give_back` returned of 128 MB that were freed, and what the process then holds above its start, in MB."""
-    run = subprocess.run([sys.executable, "-c", PROGRAM, str(objects)], capture_output=True, text=True, check=True)
+    run = subprocess.run(
+        [sys.executable, "-c", PROGRAM, str(objects)], capture_output=True, text=True, check=True
+    )
     told, returned, held = map(float, run.stdout.split())
     if told < 60:
         pytest.skip(f"this system does not say what was given back to it: {told:.1f} MB of 64")

@@ -13,7 +13,7 @@ from furnished import sheet
 from small_scenes import CONFIG, MARK, ROBUST, piece, scan
 
 from more2_jax.config import JointConfig, MeshingConfig, preset
-from more2_jax.meshing import object_mesh
+from more2_jax.meshing import engine, object_mesh
 from more2_jax.meshing.object_mesh import object_floor
 from more2_jax.registration import search, surface
 from more2_jax.scene import add_scan, reconstruct, start_scene
@@ -373,3 +373,24 @@ def test_what_was_cut_off_a_mask_comes_back_from_the_background(tiny_prior, cut_
     assert counts[0][cut_scan] == counts[1][cut_scan] + repair.regained == (~lost).sum() + repair.regained
     assert counts[0][1 - cut_scan] == counts[1][1 - cut_scan] == len(whole)
     assert not any(s.repairs for s in kept.scans)
+
+
+def test_every_new_mesh_is_kept_as_it_is_told_and_no_other(monkeypatch, tiny_prior, scene):
+    made = [Mesh(vertices=np.full((1, 3), float(k)), faces=np.zeros((0, 3), int)) for k in range(9)]
+    monkeypatch.setattr(
+        engine,
+        "object_meshes",
+        lambda prior, objects, config: map(made.__getitem__, range(len(list(objects)))),
+    )
+    kept = []
+
+    def keep(mesh):
+        kept.append(mesh)
+        return Mesh(vertices=mesh.vertices + 100, faces=mesh.faces)
+
+    *bare, last = (dataclasses.replace(o, mesh=None) for o in scene.objects)
+    old = dataclasses.replace(last, mesh=MARK)
+    done = reconstruct(tiny_prior, dataclasses.replace(scene, objects=(*bare, old)), CONFIG, keep=keep)
+    assert [id(m) for m in kept] == [id(m) for m in made[: len(bare)]]
+    assert [o.mesh.vertices[0, 0] for o in done.objects[:-1]] == [100.0 + k for k in range(len(bare))]
+    assert done.objects[-1].mesh is MARK

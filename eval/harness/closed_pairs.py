@@ -11,8 +11,8 @@ from more2_jax.config import SceneConfig
 from more2_jax.geometry.poses import apply_pose
 from more2_jax.network.prior import Prior
 from more2_jax.refinement.pose_graph_of_objects import refine_object_poses
-from more2_jax.scene import remembered
 from more2_jax.tracking.object_views import few_sensors
+from more2_jax.tracking.room_points import remembered
 from more2_jax.types import AccumulatedObject, Embedding, Scan
 
 Cloud = np.ndarray  # (n, 3), meters, in its scan's frame

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,6 +14,7 @@ from rich.table import Table
 from more2_jax.cli.options import Reading, Reporting
 from more2_jax.cli.session import Session, keep_compiled_programs
 from more2_jax.config import SceneConfig
+from more2_jax.freed_memory import LARGE
 
 if TYPE_CHECKING:
     from more2_jax.network.prior import Prior
@@ -70,7 +72,7 @@ def _build(
     scene: LivingScene | None,
 ) -> LivingScene:
     """Adds the scans `scene` lacks, saves after each, reconstructs and saves. What stops it says what is kept."""
-    from more2_jax.scene import add_scan, reconstruct, start_scene
+    from more2_jax.scene import add_scan, start_scene
 
     kept, count = 0 if scene is None else len(scene.scans), len(scans)
     session.steps = (1 if kept == 0 else 0) + _stages_of_add(config) * (count - max(kept, 1)) + 2
@@ -88,10 +90,7 @@ def _build(
             kept += 1
         if scene is None:
             raise ValueError("no scans; needed at least one")
-        scene = reconstruct(prior, scene, config, progress=session.watch)
-        tell(session, scene)
-        _save(session, scene, out, config)
-        return scene
+        return _finished(session, prior, scene, out, config)
     except (KeyboardInterrupt, OSError) as error:
         how = f"{kept} of {count} scans are kept in {out}; the same command with --resume goes on"
         if isinstance(error, OSError):
@@ -207,7 +206,7 @@ def _add(
     masks: Path | None,
     reporting: Reporting,
 ) -> None:
-    from more2_jax.scene import add_scan, reconstruct
+    from more2_jax.scene import add_scan
 
     with Session(reporting, steps=_stages_of_add(config) + 2) as session:
         earlier = [_last_source(folder, scene)] if reading.segment == "changes" else []
@@ -216,9 +215,21 @@ def _add(
         prior = _same_prior(scene, prior_name)
         scene = add_scan(prior, scene, scan, config, progress=session.watch)
         _say_done(session, scene)
-        scene = reconstruct(prior, scene, config, progress=session.watch)
+        _finished(session, prior, scene, folder, config)
+
+
+def _finished(
+    session: Session, prior: Prior, scene: LivingScene, folder: Path, config: SceneConfig
+) -> LivingScene:
+    """The scene with its meshes, said and saved. In a large scene they wait in files, and can be read until then."""
+    from more2_jax.scene import reconstruct
+    from more2_jax.storage.waiting_meshes import WaitingMeshes
+
+    with WaitingMeshes.beside(folder) if len(scene.objects) > LARGE else nullcontext() as keep:
+        scene = reconstruct(prior, scene, config, progress=session.watch, keep=keep)
         tell(session, scene)
         _save(session, scene, folder, config)
+    return scene
 
 
 def _save(session: Session, scene: LivingScene, folder: Path, config: SceneConfig) -> None:

@@ -42,9 +42,9 @@ def embed(
 
 
 def unstack(batch: Embedding, count: int) -> list[Embedding]:
-    """The first `count` embeddings of a batch, as host arrays."""
+    """The first `count` embeddings of a batch, as host arrays of their own: none keeps the batch in memory."""
     host = jax.device_get(batch)
-    return [jax.tree.map(lambda x, k=k: np.asarray(x[k]), host) for k in range(count)]
+    return [jax.tree.map(lambda x, k=k: np.array(x[k]), host) for k in range(count)]
 
 
 def stack(

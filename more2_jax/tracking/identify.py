@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -19,7 +19,7 @@ from more2_jax.network.prior import Prior
 from more2_jax.tracking.objects import SCENE_FRAME
 from more2_jax.tracking.scan_frame import common_frame
 from more2_jax.tracking.scan_height import Rooms
-from more2_jax.types import Frame, ObservedObject
+from more2_jax.types import Frame, ObservedObject, SceneObject
 
 NO_ROOMS = Rooms()
 # Of log odds, in any orientation, for pairs of what is left over: objects stay more often than the weights were fitted
@@ -144,3 +144,19 @@ def moved_m(
 def centers(objects: Sequence[ObservedObject]) -> Float[np.ndarray, "n 3"]:
     """The mean points, each in its object's frame."""
     return np.stack([o.points.mean(axis=0) for o in objects])
+
+
+def chances(
+    identified: Identified,
+    objects: Sequence[SceneObject],
+    fresh: Mapping[int, SceneObject],
+    config: SceneConfig,
+) -> dict[str, float]:
+    """Returns by object id the probability that it is really gone, back or new.
+
+    `fresh`: new objects by the rows of their instances.
+    """
+    gone = {objects[k].id: p for k, p in identified.gone.items()}
+    known = isinstance(config.matching, EvidenceMatcher)
+    back = {objects[f.object].id: f.score for f in identified.found if known}
+    return gone | back | {fresh[i].id: p for i, p in identified.new.items() if i in fresh}

@@ -23,6 +23,7 @@ Rows = Bool[np.ndarray, " n"]
 
 MOST_DROPPED = 0.5  # share of a mask: what lies more in a wall or floor than off it is a picture, or a rug
 LEAST_DROPPED = 0.01  # share of a mask: fewer are no patch, and as likely its own
+BACKGROUND_POINTS = 20_000  # of a scan, kept for the page and for free space
 BESIDE_M = 0.1  # of a mask: background that tells which way its points face
 
 
@@ -53,6 +54,11 @@ class Cleared:
             for i, d in self.dropped.items()
             if i in names
         )
+
+
+def remembered(background: Points) -> Points:
+    """Returns every k-th point of a scan's background, so that at most `BACKGROUND_POINTS` remain."""
+    return background[:: max(1, -(-len(background) // BACKGROUND_POINTS))]
 
 
 def without_room(instances: Sequence[Instance], background: Points, fewest: int) -> Cleared:

@@ -11,7 +11,7 @@ from jaxtyping import Float, Int
 
 from more2_jax.config import EvidenceMatcher
 from more2_jax.geometry.floor import floor_height
-from more2_jax.geometry.poses import Points, vertical_shift
+from more2_jax.geometry.poses import Points, apply_pose, vertical_shift
 from more2_jax.matching.assignment import LogOdds, assign
 from more2_jax.matching.candidates import (
     AlignedPairs,
@@ -23,7 +23,7 @@ from more2_jax.matching.candidates import (
 from more2_jax.matching.metric_evidence import seen_in
 from more2_jax.matching.proposals import likeliest, signatures
 from more2_jax.network.prior import Prior
-from more2_jax.types import ObservedObject
+from more2_jax.types import LivingScene, ObservedObject, Scan
 
 SPREAD_M = 0.015  # of the votes for a height
 VOTERS = 32  # partners of an object that vote: the next has 2⁻³² of the first one's weight
@@ -44,6 +44,12 @@ class Rooms:
 
     scene: Points = field(default_factory=lambda: np.zeros((0, 3)))
     scan: Points = field(default_factory=lambda: np.zeros((0, 3)))
+
+
+def rooms_of(scene: LivingScene, scan: Scan) -> Rooms:
+    """Returns the backgrounds of the scene's last scan and of a new one, both leveled."""
+    last = scene.scans[-1]
+    return Rooms(scene=apply_pose(last.frame.T_scene_scan, last.background), scan=scan.background)
 
 
 @dataclass(frozen=True, kw_only=True)

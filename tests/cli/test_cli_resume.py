@@ -15,6 +15,7 @@ from more2_jax.cli import living_scenes as building
 from more2_jax.cli.main import main
 from more2_jax.network.prior import load_prior, save_prior
 from more2_jax.storage.scene_folder import load_scene
+from more2_jax.storage.waiting_meshes import WaitingMeshes
 
 pytestmark = pytest.mark.optimized  # scenes run for longer than their programs compile
 
@@ -236,3 +237,17 @@ def test_json_lines_inside_the_scene_are_refused(tmp_path, three, capsys):
     assert "inside the living scene" in line
     missing = tmp_path / "nowhere/log.jsonl"
     assert "No such file" in refused(capsys, "run", three[0], "--out", out, "--log-json", missing)
+
+
+def test_a_large_scene_whose_meshes_wait_in_files_is_stored_the_same(tmp_path, three, tiny, monkeypatch):
+    assert main(command(three, tmp_path / "held", tiny)) == 0
+    monkeypatch.setattr(building, "LARGE", 1)
+    waited, real = [], WaitingMeshes.__call__
+    monkeypatch.setattr(WaitingMeshes, "__call__", lambda self, mesh: waited.append(mesh) or real(self, mesh))
+    assert main(command(three, tmp_path / "waited", tiny)) == 0
+    assert told(tmp_path / "held") == told(tmp_path / "waited")
+    objects = sorted((tmp_path / "held" / "objects").iterdir())
+    assert len(waited) == sum(not p.name.endswith("_points.ply") for p in objects) > 0
+    for path in objects:
+        assert (tmp_path / "waited" / "objects" / path.name).read_bytes() == path.read_bytes()
+    assert [p.name for p in tmp_path.iterdir() if p.name.startswith(".")] == []
