@@ -22,7 +22,7 @@ from scipy.spatial import KDTree
 from eval.data.masks import LOST
 from eval.data.truth import KnownObject, KnownScene
 from eval.end_to_end import living_scenes, on_all_devices
-from eval.harness.options import Options
+from eval.harness.options import OptionsBeside, benchmark, told_upright
 from eval.harness.plots import draw_over_scans
 from eval.harness.program import Program, Summary, carry_out, run_program
 from eval.harness.runs import Run, Work, open_run
@@ -53,7 +53,7 @@ PLOTTED = {
 
 
 @dataclass(frozen=True, kw_only=True)
-class Settings(Options):
+class Settings(OptionsBeside):
     """Which data, which settings, and where results go."""
 
     samples: int = 20_000
@@ -67,12 +67,16 @@ def main(options: Annotated[Settings, tyro.conf.arg(name="")]) -> None:
 
 def prepare(options: Settings) -> tuple[Run, Work]:
     """The run, and what is done with its scenes."""
-    current = open_run("accumulation", options, {"samples": options.samples})
+    ours = options.methods(told_upright(options, benchmark(options)))
+    current = open_run("accumulation", options, {"samples": options.samples, "methods": list(ours)})
 
     def one(scene: KnownScene) -> list[Record]:
         right_deg = current.data.right_deg
-        found = scene_records(scene, current.prior, current.config, right_deg, options.samples)
-        return [{"method": f"ours, {options.preset}", **r} for r in found]
+        return [
+            {"method": name, **r}
+            for name, config in ours.items()
+            for r in scene_records(scene, current.prior, config, right_deg, options.samples)
+        ]
 
     return current, lambda scenes: on_all_devices(one, scenes, options.at_once)
 

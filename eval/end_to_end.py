@@ -28,7 +28,7 @@ from eval.scores.divided_masks import with_divided_masks
 from eval.scores.figures import Figure, Record, in_columns
 from eval.scores.temporal_ap import temporal_records
 from eval.scores.tracks import Track, changes_f1, score_tracks, tracks_of
-from more2_jax.config import SceneConfig, preset
+from more2_jax.config import SceneConfig
 from more2_jax.network.prior import Prior
 from more2_jax.network.shared_calls import side_by_side
 from more2_jax.scene import add_scan, reconstruct, start_scene
@@ -81,12 +81,12 @@ def prepare(options: Settings) -> tuple[Run, Work]:
     upright = is_upright(options, data)
     peers = {NAME: without_learning(upright)} if options.peers else {}
     peers |= learned_stages(options.learned, upright)
-    facts = {"methods": [*(f"ours, {p}" for p in options.presets), *peers], "samples": options.samples}
+    ours = options.methods(told_upright(options, data))
+    facts = {"methods": [*ours, *peers], "samples": options.samples}
     current = open_run("end_to_end", options, {**facts, **stated(options.learned)})
     methods: dict[str, Callable[[KnownScene], list[Track]]] = {}
-    for name in options.presets:
-        config = preset(name, upright=told_upright(options, data))
-        methods[f"ours, {name}"] = lambda s, c=config: tracks_of(living_scene(s, current.prior, c))
+    for name, config in ours.items():
+        methods[name] = lambda s, c=config: tracks_of(living_scene(s, current.prior, c))
     for name, stages in peers.items():
         methods[name] = lambda s, p=stages: combined(s.scans, p)
 

@@ -21,7 +21,7 @@ from jaxtyping import Float, Int
 from eval.data.masks import LOST
 from eval.data.truth import KnownObject, KnownScene
 from eval.harness.batched import embed_all
-from eval.harness.options import Options
+from eval.harness.options import OptionsBeside, benchmark, told_upright
 from eval.harness.program import Program, Summary, carry_out, run_program
 from eval.harness.runs import Run, Work, open_run
 from eval.peers.learned.methods import learned_surfacers
@@ -40,7 +40,7 @@ from more2_jax.types import AccumulatedObject, Mesh, Observation
 
 
 @dataclass(frozen=True, kw_only=True)
-class Settings(Options):
+class Settings(OptionsBeside):
     """Which data, which settings, and where results go."""
 
     scans: int = 1
@@ -98,10 +98,13 @@ def main(options: Annotated[Settings, tyro.conf.arg(name="")]) -> None:
 def prepare(options: Settings) -> tuple[Run, Work]:
     """The run, and what is done with its scenes."""
     peers = (SURFACERS if options.peers else {}) | learned_surfacers(options.learned)
-    facts = {"methods": [*own_names(options.preset, preset(options.preset)), *peers], "scans": options.scans}
+    upright = told_upright(options, benchmark(options))
+    ours = {name: preset(name, upright=upright) for name in options.presets}
+    names = [n for name, config in ours.items() for n in own_names(name, config)]
+    facts = {"methods": [*names, *peers], "scans": options.scans}
     facts |= {"samples": options.samples, **stated(options.learned)}
     current = open_run("reconstruction", options, facts)
-    return current, lambda scenes: work(scenes, current.prior, current.config, peers, options)
+    return current, lambda scenes: work(scenes, current.prior, ours, peers, options)
 
 
 def own_names(preset: str, config: SceneConfig) -> tuple[str, str]:
@@ -164,25 +167,41 @@ def accumulated(scene: KnownScene, o: KnownObject, scans: int) -> Seen:
 def work(
     scenes: Sequence[KnownScene],
     prior: Prior,
-    config: SceneConfig,
+    ours: Mapping[str, SceneConfig],
     peers: Mapping[str, Surfacer],
     o: Settings,
 ) -> list[list[Record]]:
     """All objects of some scenes: encoded, and optimized, together; then one mesh after the other."""
     seen = seen_objects(scenes, o.scans)
     plain, encoding_s = timed(lambda: embedded(prior, seen, o.batch), len(seen))
-    fitted, fitting_s = timed(lambda: fitted_in_batches(prior, plain, with_joint(config), o.batch), len(seen))
-    both = [(fitted, encoding_s + fitting_s), (plain, encoding_s)]
-    names = own_names(o.preset, config)
-    records = []
-    for name, (objects, spent_s) in zip(names, both if config.joint.steps else both[::-1], strict=True):
-        records += [
-            scored(s, name, lambda own=own: next(meshes_of_objects(prior, [own], config)), spent_s, o.samples)
-            for s, own in zip(seen, objects, strict=True)
-        ]
+    records = [
+        r
+        for name, config in ours.items()
+        for r in own_records(prior, seen, plain, encoding_s, name, config, o)
+    ]
     for name, surface in peers.items():
         records += [scored(s, name, lambda s=s, f=surface: f(s.points), 0.0, o.samples) for s in seen]
     return [[r for n, r in records if n == scene.name] for scene in scenes]
+
+
+def own_records(
+    prior: Prior,
+    seen: Sequence[Seen],
+    plain: list[AccumulatedObject],
+    encoding_s: float,
+    preset: str,
+    config: SceneConfig,
+    o: Settings,
+) -> list[tuple[str, Record]]:
+    """Scene and record of every object, by a preset and by the same with or without joint optimization."""
+    fitted, fitting_s = timed(lambda: fitted_in_batches(prior, plain, with_joint(config), o.batch), len(seen))
+    both = [(fitted, encoding_s + fitting_s), (plain, encoding_s)]
+    names = own_names(preset, config)
+    return [
+        scored(s, name, lambda own=own: next(meshes_of_objects(prior, [own], config)), spent_s, o.samples)
+        for name, (objects, spent_s) in zip(names, both if config.joint.steps else both[::-1], strict=True)
+        for s, own in zip(seen, objects, strict=True)
+    ]
 
 
 def timed(stage: Callable[[], list[AccumulatedObject]], count: int) -> tuple[list[AccumulatedObject], float]:

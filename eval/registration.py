@@ -18,7 +18,7 @@ from eval.data.masks import LOST
 from eval.data.truth import KnownObject, KnownScene
 from eval.harness.batched import PairToRegister, embed_all, register_all
 from eval.harness.closed_pairs import closed_poses
-from eval.harness.options import OptionsBeside, benchmark, is_upright
+from eval.harness.options import Descending, OptionsBeside, benchmark, is_upright, undescended
 from eval.harness.plots import draw_ecdf
 from eval.harness.program import Program, Summary, carry_out, run_program
 from eval.harness.runs import Run, Work, open_run
@@ -30,7 +30,6 @@ from eval.scores.figures import Figure, Record, in_columns
 from eval.scores.pose_scores import Pose, pose_scores
 from more2_jax.config import (
     DescentRegistration,
-    FieldRegistration,
     MotionModel,
     RegistrationMethod,
     SceneConfig,
@@ -166,18 +165,9 @@ def own_settings(name: str, upright: bool) -> dict[str, RegistrationMethod]:
     """The preset's registration; without knowing the sensors; and without what follows the coarse search of starts."""
     method = preset(name, upright=upright).registration
     codes_alone = dataclasses.replace(DescentRegistration(), steps=0, icp_steps=0)
-    if isinstance(method, DescentRegistration):
-        return {
-            f"ours, {name}": method,
-            f"ours, {name}, without optimization": dataclasses.replace(method, steps=0),
-            KABSCH: codes_alone,
-        }
-    if isinstance(method, FieldRegistration):
-        return {
-            f"ours, {name}": method,
-            f"ours, {name}, without optimization": dataclasses.replace(method, search_steps=0, steps=0),
-            KABSCH: codes_alone,
-        }
+    if isinstance(method, Descending):
+        starts = undescended(method)
+        return {f"ours, {name}": method, f"ours, {name}, without optimization": starts, KABSCH: codes_alone}
     blind = dataclasses.replace(method, search=dataclasses.replace(method.search, free_weight=0.0))
     told = upright and method.search.free_weight > 0
     return {

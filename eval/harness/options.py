@@ -11,8 +11,15 @@ import numpy as np
 from eval.data.flyingshape import flyingshape
 from eval.data.threerscan import threerscan
 from eval.data.truth import Benchmark, KnownScene
-from more2_jax.config import PresetName
+from more2_jax.config import (
+    DescentRegistration,
+    FieldRegistration,
+    PresetName,
+    SceneConfig,
+    preset,
+)
 
+Descending = DescentRegistration | FieldRegistration
 Masks = Literal["true", "merged", "split", "eroded", "wrong", "predicted"]
 
 
@@ -71,11 +78,29 @@ class OptionsBeside(Options):
 
     beside: tuple[PresetName, ...] = ()
     """Other presets, each measured as further columns."""
+    without_descent: bool = False
+    """Also measure presets that register by descent without its steps: from their starts alone."""
 
     @property
     def presets(self) -> tuple[PresetName, ...]:
         """All, the run's own first, each once."""
         return tuple(dict.fromkeys((self.preset, *self.beside)))
+
+    def methods(self, upright: bool | None) -> dict[str, SceneConfig]:
+        """What is measured of ours, by name."""
+        found = {f"ours, {name}": preset(name, upright=upright) for name in self.presets}
+        for name, config in list(found.items()) if self.without_descent else ():
+            if isinstance(config.registration, Descending):
+                starts = replace(config, registration=undescended(config.registration))
+                found[f"{name}, without descent"] = starts
+        return found
+
+
+def undescended(method: Descending) -> Descending:
+    """The method without the steps of its descent."""
+    if isinstance(method, DescentRegistration):
+        return replace(method, steps=0)
+    return replace(method, search_steps=0, steps=0)
 
 
 def benchmark(o: Options) -> Benchmark:

@@ -15,7 +15,7 @@ from published_folder import write_published
 from eval import everything, report
 from eval.data.truth import KnownScene
 from eval.harness.batched import PairToRegister, embed_all, register_all
-from eval.harness.options import Options, less_told
+from eval.harness.options import Options, OptionsBeside, less_told
 from eval.harness.plots import draw_ecdf, draw_over_scans
 from eval.harness.results import finish
 from eval.harness.runs import open_run, run_scenes, start_run
@@ -208,3 +208,23 @@ def test_peers_that_cannot_run_are_told_before_the_first_scene(options, monkeypa
         start_run("test", dataclasses.replace(options, peers=True), {})
     assert not options.out.exists()
     start_run("test", options, {})
+
+
+def test_presets_without_descent_are_those_that_descend_and_differ_in_its_steps_alone(tmp_path):
+    asked = OptionsBeside(data=tmp_path, out=tmp_path, preset="paper", beside=("field", "robust", "paper"))
+    names = [f"ours, {name}" for name in ("paper", "field", "robust")]
+    assert list(asked.methods(True)) == names
+    found = dataclasses.replace(asked, without_descent=True).methods(True)
+    assert list(found) == [*names, "ours, paper, without descent", "ours, field, without descent"]
+    for name in ("paper", "field"):
+        whole, starts = found[f"ours, {name}"], found[f"ours, {name}, without descent"]
+        assert whole == preset(name, upright=True)
+        assert whole.registration.steps > 0
+        assert starts.registration.steps == 0
+        steps = {
+            k: getattr(whole.registration, k)
+            for k in ("steps", "search_steps")
+            if hasattr(whole.registration, k)
+        }
+        restored = dataclasses.replace(starts.registration, **steps)
+        assert dataclasses.replace(starts, registration=restored) == whole
