@@ -25,6 +25,8 @@ MASKS_ARE_BETTER = (
     " better: pass Mask3D's output with --masks, or name an instance property with --instance-property"
 )
 LARGEST_COORDINATE = 1e12  # in any unit; beyond, squares and sums lose all meaning
+# Steps of coordinates: from the first on they are no less than what scanners err by; with the second, legs are lost.
+STEPS_SHOW_M, STEPS_SPOIL_M = 0.002, 0.03
 CM_OR_MM = 380.0  # between 120 and 1200, a chair in either
 
 
@@ -168,6 +170,18 @@ def check_points(path: Path, points: Float[np.ndarray, "n 3"]) -> None:
         )
 
 
+def _rounded(path: Path, points: Float[np.ndarray, "n 3"], unit: str) -> tuple[str, ...]:
+    """A warning where coordinates of 32 bits have steps that show. ValueError where they spoil shapes."""
+    far = float(np.median(np.abs(points).max(axis=1)))  # of most points: some may be strays
+    step_m = float(np.spacing(np.float32(far))) * UNITS_M[unit]
+    if step_m < STEPS_SHOW_M or (points != points.astype(np.float32)).any():
+        return ()
+    said = f"coordinates about {far:.3g} are stored in 32 bits, in steps of {step_m:.2g} m"
+    if step_m >= STEPS_SPOIL_M:
+        raise ValueError(f"{path}: {said}; needed 64 bits, or coordinates near the origin")
+    return (f"{said}; with 64 bits, or coordinates near the origin, nothing is lost",)
+
+
 # --- from labeled points to instances ----------------------------------------------------------------------
 
 
@@ -179,6 +193,7 @@ def scan_of(path: Path, cloud: LabeledCloud, unit: str, min_points: int) -> Scan
             f"{path}: no instance masks; pass predicted ones with --masks, or cut it without: {CUT_WITHOUT}"
         )
     check_points(path, cloud.points)
+    coarse = _rounded(path, cloud.points, unit)
     points = cloud.points * UNITS_M[unit]
     sensors = np.zeros((0, 3)) if cloud.sensors is None else cloud.sensors
     background = points[cloud.instance <= 0]
@@ -194,7 +209,7 @@ def scan_of(path: Path, cloud: LabeledCloud, unit: str, min_points: int) -> Scan
         background=background,
         sensors=sensors * UNITS_M[unit],
         skipped=(*cloud.skipped, *skipped),
-        warnings=(*cloud.warnings, *turned, *thinned, *_unit_warnings(kept, unit)),
+        warnings=(*cloud.warnings, *coarse, *turned, *thinned, *_unit_warnings(kept, unit)),
     )
 
 

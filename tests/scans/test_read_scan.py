@@ -233,7 +233,7 @@ def test_no_instance_property_names_the_integers_there_are(tmp_path):
         tmp_path / "a.ply",
         segment=IDS.astype(np.int32),
         category=IDS.astype(np.int16),
-        quality=np.ones(500),
+        quality=np.full(500, 0.5),
         red=np.zeros(500, np.uint8),
     )
     message = fails(path)
@@ -295,3 +295,32 @@ def test_npz_that_are_damaged(tmp_path):
     assert "not a readable NPZ" in fails(path)
     np.savez(path, points=np.array([{}], object), instance=IDS)
     assert "not a readable NPZ" in fails(path)
+
+
+@pytest.mark.parametrize(
+    ("far_m", "said"), [(0.0, ""), (1e4, ""), (1e5, "in steps of 0.0078 m"), (5e5, "refused")]
+)
+def test_32_bit_coordinates_far_from_the_origin_are_said_or_refused(tmp_path, far_m, said):
+    path = two_instances(tmp_path / "room.ply", points=POINTS + far_m, kind="f4")
+    if said == "refused":
+        assert "stored in 32 bits, in steps of 0.031 m; needed 64 bits" in fails(path)
+        return
+    assert [w for w in read_scan(path).warnings if "32 bits" in w] == [
+        w for w in read_scan(path).warnings if said and said in w
+    ]
+    assert bool(said) == any("32 bits" in w for w in read_scan(path).warnings)
+
+
+def test_64_bit_coordinates_may_lie_anywhere_and_one_stray_point_is_not_where_the_scan_is(tmp_path):
+    assert read_scan(two_instances(tmp_path / "a.ply", points=POINTS + 5e6)).warnings == ()
+    stray = np.where(np.arange(len(POINTS))[:, None] == 0, 1e9, POINTS)  # of the background
+    assert not any(
+        "32 bits" in w for w in read_scan(two_instances(tmp_path / "b.ply", points=stray, kind="f4")).warnings
+    )
+
+
+def test_instances_that_cloudcompare_stored_are_read(tmp_path):
+    ids = np.where(IDS > 0, IDS, np.nan).astype(np.float32)
+    scan = read_scan(write_ply(tmp_path / "room.ply", scalar_instance=ids))
+    assert [i.id for i in scan.instances] == [3, 7]
+    assert len(scan.background) == 150

@@ -13,7 +13,6 @@ from plyfile import PlyData, PlyParseError
 from more2_jax.scans.files.ply_faces import CORNERS, face_corners, unit_or_zero, vertex_normals
 from more2_jax.scans.labeled_cloud import one_line
 
-INSTANCE_PROPERTIES = ("instance", "instance_id", "objectId", "object_id", "label")
 COLOR_PROPERTIES = ("red", "green", "blue")
 NORMAL_PROPERTIES = ("nx", "ny", "nz")
 

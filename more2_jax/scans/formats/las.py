@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Integer
 
-from more2_jax.scans.files.ply_cloud import INSTANCE_PROPERTIES
+from more2_jax.scans.instance_property import INSTANCE_PROPERTIES
 from more2_jax.scans.labeled_cloud import LabeledCloud, ReadOptions, instance_ids, one_line
 
 CHUNK = 64_000_000  # bytes of points read at once: a header that lies about their number costs no memory

@@ -9,11 +9,10 @@ from pathlib import Path
 
 import lzf
 import numpy as np
-from jaxtyping import Integer
 
-from more2_jax.scans.files.ply_cloud import INSTANCE_PROPERTIES
 from more2_jax.scans.files.ply_faces import unit_or_zero
-from more2_jax.scans.labeled_cloud import CUT_WITHOUT, LabeledCloud, ReadOptions
+from more2_jax.scans.instance_property import instance_of
+from more2_jax.scans.labeled_cloud import LabeledCloud, ReadOptions
 
 LONGEST_HEADER = 65_536  # bytes
 LONGEST_REFERENCE = 264  # bytes that three bytes of LZF, a reference back, can yield
@@ -65,12 +64,12 @@ def read(path: Path, options: ReadOptions) -> LabeledCloud:
         raise ValueError(f"{path}: fields are {names}; needed {', '.join(missing)} too")
     points = np.stack([columns[axis].astype(np.float64) for axis in "xyz"], axis=-1)
     valid = np.isfinite(points).all(axis=1)
-    name = _instance_field(path, columns, options)
+    name, instance = instance_of(path, columns, (*COLORS, *NORMALS), options, "field") or ("", None)
     labels = columns.get("label") if name != "label" else None
     colors = next((_unpacked(columns[c]) for c in COLORS if c in columns), None)
     return LabeledCloud(
         points=points[valid],
-        instance=None if name is None else _whole(path, columns[name])[valid],
+        instance=None if instance is None else instance[valid],
         colors=None if colors is None else colors[valid],
         normals=_normals(columns, np.asarray(valid)),
         point_labels=labels[valid] if labels is not None and labels.dtype.kind in "iu" else None,
@@ -93,27 +92,6 @@ def _warnings(header: Header, dropped: int) -> tuple[str, ...]:
         values = " ".join(f"{v:g}" for v in header.viewpoint)
         said.append(f"VIEWPOINT {values} is not applied: coordinates are taken as they are stored")
     return tuple(said)
-
-
-def _instance_field(path: Path, columns: dict[str, np.ndarray], options: ReadOptions) -> str | None:
-    integers = [k for k, v in columns.items() if v.dtype.kind in "iu" and k not in COLORS]
-    wanted = INSTANCE_PROPERTIES if options.instance_property is None else (options.instance_property,)
-    for name in wanted:
-        if name in integers:
-            return name
-    if not options.masks_needed and options.instance_property is None:
-        return None
-    has = f"integer fields are {', '.join(integers)}" if integers else "it has no integer field"
-    raise ValueError(
-        f"{path}: no integer field {' or '.join(wanted)} names the instance; {has} (choose one with"
-        f" --instance-property, or cut the scan without: {CUT_WITHOUT})"
-    )
-
-
-def _whole(path: Path, values: np.ndarray) -> Integer[np.ndarray, "n"]:
-    if values.dtype.kind == "u" and values.max(initial=0) > np.iinfo(np.int64).max:
-        raise ValueError(f"{path}: instance {values.max()} is too large; needed less than 2⁶³")
-    return values.astype(np.int64)
 
 
 def _unpacked(packed: np.ndarray) -> np.ndarray | None:
