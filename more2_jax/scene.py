@@ -187,6 +187,23 @@ def added(
     return dataclasses.replace(scene, scans=scans, objects=tuple(objects), changes=changes, timing_s=timing)
 
 
+def with_poses_refined(
+    prior: Prior,
+    objects: list[SceneObject],
+    chosen: Sequence[int],
+    scans: Sequence[ScanRecord],
+    config: SceneConfig,
+) -> list[SceneObject]:
+    """Returns the objects, the poses of the `chosen` refined by how their observations fit one another."""
+    for start in range(0, len(chosen), CLOSED_AT_ONCE):
+        some = chosen[start : start + CLOSED_AT_ONCE]
+        several = list(accumulated_objects(objects, some, scans))
+        refined = refine_object_poses(prior, several, config)
+        objects = with_refined(objects, some, refined)
+        give_back(len(objects))
+    return objects
+
+
 def reconstruct(
     prior: Prior,
     scene: LivingScene,
@@ -226,22 +243,6 @@ def reconstruct(
         for c in scene.changes
     )
     return dataclasses.replace(scene, objects=tuple(objects), changes=changes, timing_s=timing)
-
-
-def with_poses_refined(
-    prior: Prior,
-    objects: list[SceneObject],
-    chosen: Sequence[int],
-    scans: Sequence[ScanRecord],
-    config: SceneConfig,
-) -> list[SceneObject]:
-    """Returns the objects, the poses of the `chosen` refined by how their observations fit one another."""
-    for start in range(0, len(chosen), CLOSED_AT_ONCE):
-        some = chosen[start : start + CLOSED_AT_ONCE]
-        refined = refine_object_poses(prior, list(accumulated_objects(objects, some, scans)), config)
-        objects = with_refined(objects, some, refined)
-        give_back(len(objects))
-    return objects
 
 
 def run_scenes(
