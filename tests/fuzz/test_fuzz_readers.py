@@ -15,7 +15,7 @@ from tests.fuzz.mutations import PAGE, _crc32c
 
 MUTATIONS = 60
 FORMATS = sorted(
-    ["arkitscenes", "e57", "las", "laz", "masks", "npz", "pcd", "ply", "ply_folder"]
+    ["arkitscenes", "e57", "glb", "las", "laz", "masks", "npz", "obj", "pcd", "ply", "ply_folder"]
     + ["replica", "s3dis", "scannet", "scannetpp", "threerscan"]
 )
 

@@ -13,6 +13,7 @@ from more2_jax.scans.formats import (
     arkitscenes,
     e57,
     las,
+    mesh_scene,
     npz_scan,
     pcd,
     ply_folder,
@@ -49,6 +50,7 @@ FORMATS: tuple[Format, ...] = (
     npz_scan,
     pcd,
     las,
+    mesh_scene,
     e57,
     ply_folder,
 )

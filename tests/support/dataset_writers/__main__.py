@@ -9,6 +9,7 @@ from dataset_writers.arkitscenes import box, write_arkitscenes
 from dataset_writers.e57 import write_e57
 from dataset_writers.las import write_las
 from dataset_writers.masks import write_masks
+from dataset_writers.meshes import write_glb, write_obj
 from dataset_writers.pcd import write_pcd
 from dataset_writers.ply_file import vertex_columns, write_ply
 from dataset_writers.replica import write_replica
@@ -49,6 +50,14 @@ def plain(root: Path) -> None:
     labels = np.array(["floor", "chair", "table"])[IDS]
     np.savez(folder / "room.npz", points=POINTS, instance=IDS, label=labels, color=RGB)
     case(folder, folder / "room.npz")
+
+
+def meshes(root: Path) -> None:
+    boxes = {"chair": ((0.0, 0.5, 0.0), (0.5, 1.0, 0.5)), "table": ((2.0, 0.4, 0.0), (1.2, 0.8, 0.7))}
+    for suffix, write in (("obj", write_obj), ("glb", write_glb)):
+        folder = root / suffix / "boxes"
+        folder.mkdir(parents=True)
+        case(folder, write(folder / f"room.{suffix}", boxes))
 
 
 def surveys(root: Path) -> None:
@@ -111,7 +120,7 @@ def datasets(root: Path) -> None:
 
 def write_fixtures(root: Path) -> Path:
     """A folder a format, in it one a case."""
-    for write in (plain, surveys, masks, datasets):
+    for write in (plain, meshes, surveys, masks, datasets):
         write(root)
     return root
 
