@@ -135,7 +135,8 @@ def _as_filed(path: Path, options: ReadOptions) -> LabeledCloud:
                 raise ValueError(one_line(error)) from error  # names from the file may hold anything
     what = "a folder without .ply files" if path.is_dir() else f"suffix {path.suffix!r}"
     raise ValueError(
-        f"{path}: {what}; needed a .ply, .npz, .pcd, .las, .laz, .e57, .obj, .glb, .stl or .off file, or a folder of one .ply per object"
+        f"{path}: {what}; needed a .ply, .npz, .pcd, .las, .laz, .e57, .obj, .glb, .stl or .off, or a folder of"
+        " one .ply per object"
     )
 
 
