@@ -6,8 +6,8 @@ The decision alone, from log odds that surfaces give (`merged_masks`).
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -26,13 +26,14 @@ class LeastGain:
     """Log odds that halves must have beyond the whole, for most masks hold one object."""
 
     narrow: float  # where the halves hardly touch,
-    wide: float  # and elsewhere, where both must be known
+    wide: float  # elsewhere, where both must be known,
+    taken: float  # and where a half is what something else was found to be, hardly
 
 
 # In any orientation more fits by chance.
 LEAST_GAIN: dict[MotionModel, LeastGain] = {
-    "upright": LeastGain(narrow=2.2, wide=4.0),
-    "free": LeastGain(narrow=3.8, wide=5.9),
+    "upright": LeastGain(narrow=2.2, wide=4.0, taken=5.0),
+    "free": LeastGain(narrow=3.8, wide=5.9, taken=6.8),
 }
 
 
@@ -69,22 +70,45 @@ class Wholes:
     scale: Sequence[float]  # F_s of the other scan's clouds
     odds: Mapping[int, float]  # log odds of a cloud with its partner
     least: LeastGain  # of its divisions
+    # As `left`, though something was found to be each, hardly: log odds that are lost with it.
+    doubtful: Mapping[int, float] = field(default_factory=dict)
 
     def in_doubt(self, whole: int) -> bool:
         """Whether a division of the cloud could say what those left are."""
         if whole in self.partner:
-            return len(self.left) > 0 and self.odds[whole] < SURE
-        return len(self.left) > 1
+            return len(self.to_be_had(whole)) > 0 and self.odds[whole] < SURE
+        return len(self.to_be_had(whole)) > 1
+
+    def to_be_had(self, whole: int) -> list[int]:
+        """Those of the other scan that parts of a cloud may be, its own partner aside."""
+        return sorted({*self.left, *self.doubtful} - {self.partner.get(whole)})
 
     def may_be(self, part: Part) -> list[int]:
-        """Those of the other scan that a half may be: left or its whole's, of about its size."""
-        rows = [*self.left, *([self.partner[part.whole]] if part.whole in self.partner else [])]
+        """Those of the other scan that a half may be: to be had or its whole's, of about its size."""
+        own = [self.partner[part.whole]] if part.whole in self.partner else []
+        rows = [*self.to_be_had(part.whole), *own]
         ratio = np.log(float(part.embedding.scale) / np.array([self.scale[k] for k in rows]))
         return [k for k, r in zip(rows, ratio, strict=True) if abs(r) < SAME_SIZE]
 
-    def gained(self, whole: int) -> float:
-        """Log odds that are lost with the whole."""
-        return max(self.odds[whole], 0.0) if whole in self.partner else 0.0
+    def lost(self, whole: int, taken: Iterable[int]) -> float:
+        """Log odds that are lost with a whole, and with what its halves take from others."""
+        with_whole = max(self.odds[whole], 0.0) if whole in self.partner else 0.0
+        return with_whole + sum(max(self.doubtful[k], 0.0) for k in taken)
+
+    def taken(self, whole: int, others: Iterable[int | None]) -> list[int]:
+        """Which of these something other than the whole was found to be."""
+        return [k for k in others if k is not None and k in self.doubtful and k != self.partner.get(whole)]
+
+    def enough(self, division: Division) -> bool:
+        """Whether a division gains enough. One that says what none is which is missing needs one to be missing."""
+        whole = division.parts[0].whole
+        if not (self.left or set(division.others) - {None, self.partner.get(whole)}):
+            return False
+        if self.taken(whole, division.others) and division.gain <= self.least.taken:
+            return False
+        if division.parts[0].narrow:
+            return division.gain > self.least.narrow
+        return None not in division.others and division.gain > self.least.wide
 
 
 def chosen(halves: Sequence[tuple[Part, Part]], wholes: Wholes, weigh: Weigh) -> list[Division]:
@@ -105,25 +129,22 @@ def chosen(halves: Sequence[tuple[Part, Part]], wholes: Wholes, weigh: Weigh) ->
                     {k: odds.get((row[k], 2 * n + side), NEVER) for k in wholes.may_be(p)}
                     for side, p in enumerate(pair)
                 ],
-                wholes.gained(pair[0].whole),
-                wholes.least,
+                wholes,
             )
         ]
     )
 
 
-def proposals(
-    pair: tuple[Part, Part], odds: Sequence[Mapping[int, float]], gained: float, least: LeastGain
-) -> list[Division]:
+def proposals(pair: tuple[Part, Part], odds: Sequence[Mapping[int, float]], wholes: Wholes) -> list[Division]:
     """What two halves may be, where that gains enough. `odds`: of each with what it may be."""
     fits = [{None: 0.0} | {k: o for k, o in of_half.items() if o > 0} for of_half in odds]
     found = []
     for first, second in itertools.product(*fits):
-        gain = fits[0][first] + fits[1][second] - gained
-        both = first is not None and second is not None
-        enough = gain > least.narrow if pair[0].narrow else both and gain > least.wide
-        if enough and first != second:
-            found.append(Division(parts=pair, others=(first, second), gain=gain))
+        whole, others = pair[0].whole, (first, second)
+        gain = fits[0][first] + fits[1][second] - wholes.lost(whole, wholes.taken(whole, others))
+        division = Division(parts=pair, others=others, gain=float(gain))
+        if first != second and wholes.enough(division):
+            found.append(division)
     return found
 
 

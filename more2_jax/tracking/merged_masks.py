@@ -14,7 +14,7 @@ from jaxtyping import Float
 from scipy.spatial import KDTree
 
 from more2_jax.geometry.normalized_cut import Cut, Rows, thinnest_cuts
-from more2_jax.geometry.poses import Points
+from more2_jax.geometry.poses import Points, apply_pose
 from more2_jax.geometry.transform import transform
 from more2_jax.matching.color import color_of
 from more2_jax.network.embedding_batch import embed
@@ -31,6 +31,7 @@ Normals = Float[np.ndarray, "n 3"]
 # Chosen on rooms of regime `real`, docs/developing/notebook/mask_repair.md.
 LEAST_PART = 0.1  # share of a mask's points that either half must have
 CUTS = 2  # of a graph, that are tried
+LEAST_COMMON = 0.5  # share of a thing's points that lie on a mask which may hold it
 NEIGHBORS = 7  # of a point, itself among them, that say whether it lies beside a thing
 
 
@@ -76,8 +77,14 @@ def divisions_of_instances(compared: Comparison, instances: Sequence[Instance]) 
     """Which instances hold two objects that are known apart."""
     partner = {f.instance: f.object for f in compared.identified.found}
     wholes = wholes_of(compared, partner, compared.old, side=1)
+    T_scan_scene = np.linalg.inv(compared.identified.frame.T_scene_scan)
     cuts = {
-        i: cuts_of(compared, o.points, compared.object_there(partner[i], i) if i in partner else None)
+        i: cuts_of(
+            compared,
+            o.points,
+            compared.object_there(partner[i], i) if i in partner else None,
+            [apply_pose(T_scan_scene, compared.old[k].points) for k in wholes.to_be_had(i)],
+        )
         for i, o in enumerate(compared.new)
         if wholes.in_doubt(i)
     }
@@ -104,9 +111,13 @@ def divisions_of_objects(compared: Comparison, objects: Sequence[SceneObject]) -
     partner = {f.object: f.instance for f in compared.identified.found}
     wholes = wholes_of(compared, partner, compared.new, side=0)
     seen_once = [k for k, o in enumerate(objects) if len(o.observations) == 1]
+    T_scene_scan = compared.identified.frame.T_scene_scan
     cuts = {
         k: cuts_of(
-            compared, compared.old[k].points, compared.instance_there(k, partner[k]) if k in partner else None
+            compared,
+            compared.old[k].points,
+            compared.instance_there(k, partner[k]) if k in partner else None,
+            [apply_pose(T_scene_scan, compared.new[i].points) for i in wholes.to_be_had(k)],
         )
         for k in seen_once
         if wholes.in_doubt(k)
@@ -131,8 +142,13 @@ def divisions_of_objects(compared: Comparison, objects: Sequence[SceneObject]) -
     )
 
 
-def cuts_of(compared: Comparison, points: Points, partner: Points | None) -> list[Cut]:
-    """How a cloud may fall in two: beside what it was found to be, and where it is thinnest."""
+def cuts_of(
+    compared: Comparison, points: Points, partner: Points | None, others: Sequence[Points]
+) -> list[Cut]:
+    """How a cloud may fall in two: beside what it was found to be, at its thinnest, beside what stands there.
+
+    `others`: clouds of the other scan that it may be a part of, as if none had moved.
+    """
     first: list[Cut] = []
     if partner is not None:
         rest = beside_of(partner, points)
@@ -142,6 +158,7 @@ def cuts_of(compared: Comparison, points: Points, partner: Points | None) -> lis
     thin = thinnest_cuts(points, CUTS, LEAST_PART)
     first = first or thin[:1]
     cuts = [*first, *(c for c in thin if c[1] and c is not first[0])]
+    cuts += [(beside_of(o, points), False) for o in others if stands_in(o, points)]
     fewest = max(compared.config.min_points, LEAST_PART * len(points))
     return [c for c in cuts if min(c[0].sum(), (~c[0]).sum()) >= fewest]
 
@@ -168,11 +185,13 @@ def wholes_of(
     compared: Comparison, partner: Mapping[int, int], others: Sequence[ObservedObject], side: int
 ) -> Wholes:
     """How the clouds of one scan, objects (side 0) or instances (1), stand to `others`, those of the other."""
+    odds = compared.odds_of_found(side)
     return Wholes(
         partner=partner,
         left=sorted(set(range(len(others))) - set(partner.values())),
         scale=[float(o.embedding.scale) for o in others],
-        odds=compared.odds_of_found(side),
+        odds=odds,
+        doubtful={k: odds[w] for w, k in partner.items() if odds[w] < compared.even_odds},
         least=LEAST_GAIN[compared.config.motion],
     )
 
@@ -183,6 +202,17 @@ def beside_of(whole: Points, points: Points) -> Rows:
     off = ~np.isfinite(distance)
     _, near = KDTree(points).query(points, k=min(NEIGHBORS, len(points)))
     return off[near].reshape(len(points), -1).mean(axis=1) > 0.5
+
+
+def stands_in(other: Points, points: Points) -> bool:
+    """Whether a cloud, or what a view shows of it, lies on points of another."""
+    reach = reach_m(other)
+    if (other.min(axis=0) - reach > points.max(axis=0)).any() or (
+        points.min(axis=0) - reach > other.max(axis=0)
+    ).any():
+        return False
+    distance, _ = KDTree(points).query(other, distance_upper_bound=reach)
+    return bool(np.isfinite(distance).mean() > LEAST_COMMON)
 
 
 def larger_first(side: Rows) -> tuple[Rows, Rows]:

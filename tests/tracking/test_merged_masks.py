@@ -5,7 +5,7 @@ import pytest
 from boxes import box, two_boxes
 
 from more2_jax.tracking.divisions import LEAST_GAIN, Division, Part, Wholes, chosen, compatible
-from more2_jax.tracking.merged_masks import beside_of, larger_first
+from more2_jax.tracking.merged_masks import beside_of, larger_first, stands_in
 from more2_jax.types import Embedding
 
 
@@ -34,16 +34,19 @@ def pair(whole=0, narrow=False):
     return tuple(Part(whole=whole, rows=s, embedding=CODE, narrow=narrow) for s in sides)
 
 
-def decided(odds, *, partner=None, now=0.0, narrow=False, scale=(1.0, 1.0, 1.0), motion="upright"):
-    """What becomes of one mask whose halves have `odds` (others, 2)."""
+def decided(
+    odds, *, partner=None, now=0.0, narrow=False, scale=(1.0, 1.0, 1.0), motion="upright", doubtful=()
+):
+    """What becomes of one mask whose halves have `odds` (others, 2). `doubtful`: others that something hardly is."""
     odds = np.asarray(odds, float)
     partner = {} if partner is None else {0: partner}
     wholes = Wholes(
         partner=partner,
-        left=[k for k in range(len(odds)) if k not in partner.values()],
+        left=[k for k in range(len(odds)) if k not in partner.values() and k not in dict(doubtful)],
         scale=scale[: len(odds)],
         odds={0: now},
         least=LEAST_GAIN[motion],
+        doubtful=dict(doubtful),
     )
     return chosen([pair(narrow=narrow)], wholes, lambda _, others: dict(np.ndenumerate(odds[others])))
 
@@ -89,6 +92,46 @@ def test_in_any_orientation_a_division_must_gain_more(gain, narrow):
 )
 def test_other_masks_stay_whole(odds, options):
     assert decided(odds, **options) == []
+
+
+@pytest.mark.parametrize(("held", "gain"), [(1.5, 7.5), (-2.0, 9.0), (3.9, 5.1), (4.1, None)])
+def test_a_half_may_take_what_something_else_hardly_is_at_the_cost_of_that(held, gain):
+    """The whole has log odds of 1 with the first, its halves of 5 each; another mask has the second."""
+    found = decided([[5, -5], [-5, 5]], partner=0, now=1.0, doubtful={1: held})
+    assert [d.gain for d in found] == ([] if gain is None else [pytest.approx(gain)])
+    assert all(d.others == (0, 1) for d in found)
+
+
+def test_nothing_is_lost_twice_with_a_mask_that_was_hardly_found():
+    (d,) = decided([[5, -5], [-5, 5]], partner=0, now=1.0, doubtful={0: 1.0})
+    assert d.gain == pytest.approx(9.0)
+
+
+def test_half_of_what_was_found_stays_with_it_where_nothing_is_missing():
+    """A thread, and a half that is the partner's: only where something is left may the other half be something else."""
+    odds = [[7, -5], [-5, -5], [-5, -5]]
+    assert decided(odds, partner=0, now=1.0, narrow=True)
+    assert not decided(odds, partner=0, now=1.0, narrow=True, doubtful={1: 1.0, 2: 1.0})
+
+
+@pytest.mark.parametrize(("shift", "there"), [(0.0, True), (0.01, True), (0.3, False), (5.0, False)])
+def test_a_thing_stands_in_a_mask_that_holds_it_where_it_was(shift, there):
+    points, true = two_boxes(0.3)
+    thing = box(9, [1.0, 0.6, 0.7], [0.0, 0.0, shift], 2000)
+    assert stands_in(thing, points) == there
+    if there:
+        assert agreement(beside_of(thing, points), true) > 0.95
+
+
+def test_half_of_a_thing_may_be_seen_from_elsewhere():
+    points, true = two_boxes(0.3)
+    thing = points[true]
+    elsewhere = thing[:, 0] > np.quantile(thing[:, 0], 0.6)
+    hidden = np.where(
+        elsewhere[:, None], thing + [0.0, 9.0, 0.0], thing
+    )  # four tenths that the mask does not show
+    assert stands_in(hidden, points)
+    assert not stands_in(np.where(elsewhere[:, None], thing, thing + [0.0, 9.0, 0.0]), points)
 
 
 def test_what_hangs_by_a_thread_is_divided_for_one_known_half():
