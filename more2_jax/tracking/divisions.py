@@ -79,9 +79,14 @@ class Wholes:
             return len(self.to_be_had(whole)) > 0 and self.odds[whole] < SURE
         return len(self.to_be_had(whole)) > 1
 
+    @property
+    def may_be_taken(self) -> list[int]:
+        """Those of the other scan that parts of any cloud may be."""
+        return sorted({*self.left, *self.doubtful})
+
     def to_be_had(self, whole: int) -> list[int]:
-        """Those of the other scan that parts of a cloud may be, its own partner aside."""
-        return sorted({*self.left, *self.doubtful} - {self.partner.get(whole)})
+        """The same, a cloud's own partner aside."""
+        return [k for k in self.may_be_taken if k != self.partner.get(whole)]
 
     def may_be(self, part: Part) -> list[int]:
         """Those of the other scan that a half may be: to be had or its whole's, of about its size."""

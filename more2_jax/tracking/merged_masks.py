@@ -7,14 +7,15 @@ be, proposes how a mask may fall in two; surfaces decide, as they decide who is 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
 from scipy.spatial import KDTree
 
 from more2_jax.geometry.normalized_cut import Cut, Rows, thinnest_cuts
-from more2_jax.geometry.poses import Points, apply_pose
+from more2_jax.geometry.poses import Points, Pose, apply_pose
 from more2_jax.geometry.transform import transform
 from more2_jax.matching.color import color_of
 from more2_jax.network.embedding_batch import embed
@@ -33,6 +34,44 @@ LEAST_PART = 0.1  # share of a mask's points that either half must have
 CUTS = 2  # of a graph, that are tried
 LEAST_COMMON = 0.5  # share of a thing's points that lie on a mask which may hold it
 NEIGHBORS = 7  # of a point, itself among them, that say whether it lies beside a thing
+
+
+@dataclass(frozen=True, kw_only=True)
+class Standing:
+    """Clouds of one scan where they stand in the other's frame, as if none had moved."""
+
+    clouds: dict[int, Points]  # by their rows
+    low: Float[np.ndarray, "n 3"]  # of their boxes
+    high: Float[np.ndarray, "n 3"]
+
+    @classmethod
+    def of(cls, rows: Iterable[int], objects: Sequence[ObservedObject], T: Pose) -> Standing:
+        """The objects of these rows, placed by `T`."""
+        clouds = {k: apply_pose(T, objects[k].points) for k in rows}
+        low, high = (np.array([f(c) for c in clouds.values()]).reshape(-1, 3) for f in (lowest, highest))
+        return cls(clouds=clouds, low=low, high=high)
+
+    def within(self, points: Points, but: int | None = None) -> list[Points]:
+        """Those of which half the points or more lie on a cloud; not the one of row `but`."""
+        apart = np.any((self.low > highest(points)) | (self.high < lowest(points)), axis=1)
+        rows = np.array(list(self.clouds), int)[~apart]
+        near = [self.clouds[k] for k in rows.tolist() if k != but]
+        tree = KDTree(points) if near else None
+        return [c for c in near if tree is not None and share_near(tree, c) >= LEAST_COMMON]
+
+
+def lowest(points: Points) -> Float[np.ndarray, "3"]:
+    return points.min(axis=0)
+
+
+def highest(points: Points) -> Float[np.ndarray, "3"]:
+    return points.max(axis=0)
+
+
+def share_near(tree: KDTree, points: Points) -> float:
+    """Share of the points that lie on a cloud."""
+    distance, _ = tree.query(points, distance_upper_bound=reach_m(points))
+    return float(np.isfinite(distance).mean())
 
 
 def divide_merged(whole: Regrouped, compared: Comparison, first_number: int) -> Regrouped | None:
@@ -78,12 +117,13 @@ def divisions_of_instances(compared: Comparison, instances: Sequence[Instance]) 
     partner = {f.instance: f.object for f in compared.identified.found}
     wholes = wholes_of(compared, partner, compared.old, side=1)
     T_scan_scene = np.linalg.inv(compared.identified.frame.T_scene_scan)
+    standing = Standing.of(wholes.may_be_taken, compared.old, T_scan_scene)
     cuts = {
         i: cuts_of(
             compared,
             o.points,
             compared.object_there(partner[i], i) if i in partner else None,
-            [apply_pose(T_scan_scene, compared.old[k].points) for k in wholes.to_be_had(i)],
+            standing.within(o.points, partner.get(i)),
         )
         for i, o in enumerate(compared.new)
         if wholes.in_doubt(i)
@@ -111,13 +151,13 @@ def divisions_of_objects(compared: Comparison, objects: Sequence[SceneObject]) -
     partner = {f.object: f.instance for f in compared.identified.found}
     wholes = wholes_of(compared, partner, compared.new, side=0)
     seen_once = [k for k, o in enumerate(objects) if len(o.observations) == 1]
-    T_scene_scan = compared.identified.frame.T_scene_scan
+    standing = Standing.of(wholes.may_be_taken, compared.new, compared.identified.frame.T_scene_scan)
     cuts = {
         k: cuts_of(
             compared,
             compared.old[k].points,
             compared.instance_there(k, partner[k]) if k in partner else None,
-            [apply_pose(T_scene_scan, compared.new[i].points) for i in wholes.to_be_had(k)],
+            standing.within(compared.old[k].points, partner.get(k)),
         )
         for k in seen_once
         if wholes.in_doubt(k)
@@ -145,10 +185,7 @@ def divisions_of_objects(compared: Comparison, objects: Sequence[SceneObject]) -
 def cuts_of(
     compared: Comparison, points: Points, partner: Points | None, others: Sequence[Points]
 ) -> list[Cut]:
-    """How a cloud may fall in two: beside what it was found to be, at its thinnest, beside what stands there.
-
-    `others`: clouds of the other scan that it may be a part of, as if none had moved.
-    """
+    """How a cloud may fall in two: beside what it was found to be, at its thinnest, beside what stands in it."""
     first: list[Cut] = []
     if partner is not None:
         rest = beside_of(partner, points)
@@ -158,7 +195,7 @@ def cuts_of(
     thin = thinnest_cuts(points, CUTS, LEAST_PART)
     first = first or thin[:1]
     cuts = [*first, *(c for c in thin if c[1] and c is not first[0])]
-    cuts += [(beside_of(o, points), False) for o in others if stands_in(o, points)]
+    cuts += [(beside_of(o, points), False) for o in others]
     fewest = max(compared.config.min_points, LEAST_PART * len(points))
     return [c for c in cuts if min(c[0].sum(), (~c[0]).sum()) >= fewest]
 
@@ -202,17 +239,6 @@ def beside_of(whole: Points, points: Points) -> Rows:
     off = ~np.isfinite(distance)
     _, near = KDTree(points).query(points, k=min(NEIGHBORS, len(points)))
     return off[near].reshape(len(points), -1).mean(axis=1) > 0.5
-
-
-def stands_in(other: Points, points: Points) -> bool:
-    """Whether a cloud, or what a view shows of it, lies on points of another."""
-    reach = reach_m(other)
-    if (other.min(axis=0) - reach > points.max(axis=0)).any() or (
-        points.min(axis=0) - reach > other.max(axis=0)
-    ).any():
-        return False
-    distance, _ = KDTree(points).query(other, distance_upper_bound=reach)
-    return bool(np.isfinite(distance).mean() > LEAST_COMMON)
 
 
 def larger_first(side: Rows) -> tuple[Rows, Rows]:

@@ -3,10 +3,12 @@
 import numpy as np
 import pytest
 from boxes import box, two_boxes
+from factories import turn_z
 
+from more2_jax.geometry.poses import apply_pose
 from more2_jax.tracking.divisions import LEAST_GAIN, Division, Part, Wholes, chosen, compatible
-from more2_jax.tracking.merged_masks import beside_of, larger_first, stands_in
-from more2_jax.types import Embedding
+from more2_jax.tracking.merged_masks import Standing, beside_of, larger_first
+from more2_jax.types import Embedding, ObservedObject
 
 
 def agreement(side, true):
@@ -114,13 +116,31 @@ def test_half_of_what_was_found_stays_with_it_where_nothing_is_missing():
     assert not decided(odds, partner=0, now=1.0, narrow=True, doubtful={1: 1.0, 2: 1.0})
 
 
+def standing_in(points, *clouds, T=None, but=None):
+    """Which of the clouds stand in the points, by their first coordinates."""
+    objects = [ObservedObject(points=c, embedding=CODE) for c in clouds]
+    T = np.eye(4) if T is None else T
+    return [c[0, 0] for c in Standing.of(range(len(clouds)), objects, T).within(points, but)]
+
+
 @pytest.mark.parametrize(("shift", "there"), [(0.0, True), (0.01, True), (0.3, False), (5.0, False)])
 def test_a_thing_stands_in_a_mask_that_holds_it_where_it_was(shift, there):
     points, true = two_boxes(0.3)
     thing = box(9, [1.0, 0.6, 0.7], [0.0, 0.0, shift], 2000)
-    assert stands_in(thing, points) == there
+    assert standing_in(points, thing) == ([thing[0, 0]] if there else [])
     if there:
         assert agreement(beside_of(thing, points), true) > 0.95
+
+
+def test_clouds_are_placed_and_the_partner_is_left_out():
+    points, true = two_boxes(0.3)
+    wide, narrow = points[true], points[~true]
+    T = turn_z(np.deg2rad(40), np.zeros(3), np.array([3.0, -1.0, 0.2]))
+    away = [apply_pose(np.linalg.inv(T), c) for c in (wide, narrow)]
+    assert standing_in(points, *away) == []
+    assert standing_in(points, *away, T=T) == pytest.approx([wide[0, 0], narrow[0, 0]])
+    assert standing_in(points, *away, T=T, but=0) == pytest.approx([narrow[0, 0]])
+    assert standing_in(points) == []
 
 
 def test_half_of_a_thing_may_be_seen_from_elsewhere():
@@ -130,8 +150,8 @@ def test_half_of_a_thing_may_be_seen_from_elsewhere():
     hidden = np.where(
         elsewhere[:, None], thing + [0.0, 9.0, 0.0], thing
     )  # four tenths that the mask does not show
-    assert stands_in(hidden, points)
-    assert not stands_in(np.where(elsewhere[:, None], thing, thing + [0.0, 9.0, 0.0]), points)
+    assert len(standing_in(points, hidden)) == 1
+    assert standing_in(points, np.where(elsewhere[:, None], thing, thing + [0.0, 9.0, 0.0])) == []
 
 
 def test_what_hangs_by_a_thread_is_divided_for_one_known_half():
