@@ -44,7 +44,10 @@ Gradient = Float[np.ndarray, " w"]  # of all weights, in one row
 
 @contextmanager
 def rounded(parts: str) -> Iterator[None]:
-    """Within, what is traced multiplies in bfloat16: in the decoder ("d"), in the encoder ("e"), or in both."""
+    """Within, what is traced multiplies in bfloat16: in the decoder ("d"), in the encoder ("e"), in both or neither."""
+    if not parts:
+        yield
+        return
     jax.clear_caches()
     with (
         patch.object(decoder, "product", product if "d" in parts else decoder.product),

@@ -30,7 +30,14 @@ def exact(tiny_prior, batch):
 
 
 @pytest.mark.parametrize(
-    ("parts", "turns_stay", "least"), [("d", True, 0.9), ("e", False, 0.3), ("de", False, 0.3)]
+    ("parts", "turns_stay", "least"),
+    [
+        ("d", True, 0.9),
+        pytest.param(
+            "e", False, 0.3, marks=pytest.mark.slow
+        ),  # all programs of a process are compiled anew each time
+        pytest.param("de", False, 0.3, marks=pytest.mark.slow),
+    ],
 )
 def test_each_part_is_rounded_and_little_changes(tiny_prior, batch, exact, parts, turns_stay, least):
     with rounded(parts):
