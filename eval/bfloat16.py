@@ -49,12 +49,14 @@ def rounded(parts: str) -> Iterator[None]:
         yield
         return
     jax.clear_caches()
-    with (
-        patch.object(decoder, "product", product if "d" in parts else decoder.product),
-        patch.object(vector_neurons, "linear", product if "e" in parts else vector_neurons.linear),
-    ):
-        yield
-    jax.clear_caches()
+    try:
+        with (
+            patch.object(decoder, "product", product if "d" in parts else decoder.product),
+            patch.object(vector_neurons, "linear", product if "e" in parts else vector_neurons.linear),
+        ):
+            yield
+    finally:
+        jax.clear_caches()
 
 
 def product(
@@ -134,7 +136,7 @@ def answered(prior: Prior, batch: Batch) -> dict[str, np.ndarray]:
 
 @jax.jit
 def answers_of(prior: Prior, batch: Mapping[str, Array]) -> dict[str, Array]:
-    """Of every shape, one after the other: fifty thousand queries of one fill a processor."""
+    """Of every shape, one after the other: the queries of one fill a processor."""
 
     def one(x: Mapping[str, Array]) -> dict[str, Array]:
         codes = jax.vmap(partial(encoded, prior))(x["clouds"], x["normals"])
@@ -152,16 +154,14 @@ def answers_of(prior: Prior, batch: Mapping[str, Array]) -> dict[str, Array]:
 
 
 def encoded(prior: Prior, points: Float[Array, "n 3"], normals: Float[Array, "n 3"]) -> Embedding:
+    """The code of one cloud without padding."""
     return encode_one(prior, points, jnp.ones(len(points), bool), normals)
 
 
 def gradient_of(prior: Prior, batch: Batch) -> Gradient:
     """How a batch would have the weights change: of the mean error of distances near the surfaces (L1)."""
-    few = {k: jnp.asarray(batch[k][:, 0] if k != "near" else batch[k][:, ::8], jnp.float32) for k in SEEN}
-    return np.asarray(l1_gradient(prior, few))
-
-
-SEEN = ("clouds", "normals", "near")
+    few = {"clouds": batch["clouds"][:, 0], "normals": batch["normals"][:, 0], "near": batch["near"][:, ::8]}
+    return np.asarray(l1_gradient(prior, jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), few)))
 
 
 @jax.jit

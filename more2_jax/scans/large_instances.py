@@ -1,4 +1,4 @@
-"""Instances of more points than any stage makes use of, thinned evenly in space."""
+"""Instances of very many points, thinned evenly in space: searches for neighbors take time for every one."""
 
 from __future__ import annotations
 
@@ -10,15 +10,13 @@ from jaxtyping import Float, Integer
 
 from more2_jax.types import Instance
 
-MOST_POINTS = (
-    10_000  # of an instance: 2 cm apart on a sofa, as in scans fused at 2 to 4 cm; no stage asks for more
-)
+# Of an instance: 2 cm apart on a sofa, and scans are fused at 2 to 4 cm.
+MOST_POINTS = 10_000
 FINEST = 1 / 4096  # first side of a cell, as a share of the instance's size
 FARTHEST = 2**53  # cells: where stray points lie, whole numbers still being exact
 STEP = 1.1  # a cell's side grows by this factor at least, until few enough cells are occupied
-MIXED = np.array(
-    [73_856_093, 19_349_663, 83_492_791], np.int64
-)  # cell → key; where two share one, one is dropped
+# One number of a cell. Where two cells share one, one is dropped.
+MIXED = np.array([73_856_093, 19_349_663, 83_492_791], np.int64)
 
 
 def thinned_instances(instances: Sequence[Instance]) -> tuple[tuple[Instance, ...], tuple[str, ...]]:

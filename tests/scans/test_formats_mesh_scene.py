@@ -73,6 +73,19 @@ def test_one_mesh_has_no_masks_and_may_be_cut(tmp_path, suffix):
     assert len(cloud.points) > 3_000
 
 
+def test_up_is_y_of_gltf_whether_it_is_said_or_not(tmp_path):
+    silent, said = (scan_of(tmp_path, "glb", up=up) for up in ("z", "y"))
+    for a, b in zip(silent.instances, said.instances, strict=True):
+        np.testing.assert_allclose(a.points, b.points, atol=1e-12)
+
+
+@pytest.mark.parametrize("suffix", WRITERS)
+def test_masks_of_vertices_are_not_laid_on_points_drawn_anew(tmp_path, suffix):
+    np.savez(tmp_path / "masks.npz", objectId=np.ones(24, int))
+    with pytest.raises(ValueError, match="masks speak of a file's points"):
+        scan_of(tmp_path, suffix, masks=tmp_path / "masks.npz")
+
+
 def test_points_lie_evenly_over_faces_of_any_size(tmp_path):
     cloud = mesh_scene.read(write_glb(tmp_path / "a.glb", {"a": TABLE}), ReadOptions())
     on_top = np.isclose(cloud.points[:, 2], 0.7)

@@ -1,7 +1,7 @@
 """Meshes as apps and modelers export them: OBJ, glTF (GLB), STL, OFF. Points lie evenly on the faces.
 
-A file of several named meshes holds an object each, unless the scan is to be cut otherwise (`--segment`, `--masks`). Of
-glTF y is up and meters are the unit, by its standard; the others are taken as they are.
+A file of several named meshes holds an object each, unless the scan is to be cut otherwise (`--segment`). Of glTF y is
+up and meters are the unit, by its standard; the others are taken as they are.
 """
 
 from __future__ import annotations
@@ -25,9 +25,7 @@ GLTF, OTHERS = (".glb", ".gltf"), (".obj", ".stl", ".off")
 SPACING = 1 / 150  # of points, as a share of the diagonal of a mesh; and as many as it has vertices, at least
 MOST_OF_A_ROOM = 2_000_000  # points
 NUMBER = re.compile(r"[\s._-]*\d+$")  # after a name
-AS_OBJECTS = (
-    "every mesh of the file is taken as an object; --segment cuts the whole instead, --masks lays masks on it"
-)
+AS_OBJECTS = "every mesh of the file is taken as an object; --segment cuts the whole instead"
 
 
 def recognizes(path: Path) -> bool:
@@ -36,14 +34,21 @@ def recognizes(path: Path) -> bool:
 
 
 def read(path: Path, options: ReadOptions) -> LabeledCloud:
-    """Points on the faces; ids count from 1 in the order of the names. Raises ValueError, in one line, for no faces."""
+    """Points on the faces; ids count from 1 in the order of the names.
+
+    Raises ValueError, in one line, for no faces, and for masks, which speak of the rows of a cloud.
+    """
+    if options.masks is not None:
+        raise ValueError(f"{path}: masks speak of a file's points, and a mesh's are drawn anew; needed a PLY")
     meshes = _meshes(path)
     as_objects = len(meshes) > 1 and options.masks_needed
     rooms = [not as_objects or is_background(name) for name, _ in meshes]
     most = [MOST_OF_A_ROOM if room else MOST_POINTS for room in rooms]
     sampled = [_sampled(mesh, n) for (_, mesh), n in zip(meshes, most, strict=True)]
     normals = [mesh.face_normals[face] for (_, mesh), (_, face) in zip(meshes, sampled, strict=True)]
-    R = R_UP["y"] if path.suffix.lower() in GLTF else np.eye(3)
+    R = (
+        R_UP["y"] if path.suffix.lower() in GLTF and options.up != "y" else np.eye(3)
+    )  # `--up y` turns it itself
     count, instance, labels, skipped = [len(p) for p, _ in sampled], None, {}, ()
     if as_objects:
         labels = {k: name for k, (name, _) in enumerate(meshes, start=1)}
