@@ -120,13 +120,27 @@ def fit_from_any_yaw(a: RoomShape, b: RoomShape) -> RoomFit | None:
 
     None where no pose fits, or two fit that differ.
     """
+    fits = fits_from_any_yaw(a, b)
+    return fits[0] if fits and all(f.closeness < CLEARLY * fits[0].closeness for f in fits[1:]) else None
+
+
+def fits_from_any_yaw(a: RoomShape, b: RoomShape) -> list[RoomFit]:
+    """All poses that fit and differ, the closest first. Scans as `fit_from_any_yaw` takes them."""
     rough = [_fit(a, _fewer(b), T, REACHES_M[:2]) for T in _begun(a, b)]
     most = max((f.share for f in rough), default=0.0)
     fits = [_fit(a, b, f.T_a_b, REACHES_M[1:]) for f in rough if f.share >= max(FITS, most) / 2]
-    fits = sorted((f for f in fits if f.share >= FITS), key=lambda f: -f.closeness)
-    others = (f for f in fits[1:] if _apart_m(fits[0], f, b.points) > DIFFERENT_M)
-    rival = next(others, None)
-    return fits[0] if fits and (rival is None or rival.closeness < CLEARLY * fits[0].closeness) else None
+    fits = _different([f for f in fits if f.share >= FITS], b)
+    turned = [_fit(a, b, _half_turned(a, b, f.T_a_b)) for f in fits]
+    return _different(fits + [f for f in turned if f.share >= FITS], b)
+
+
+def _different(fits: list[RoomFit], b: RoomShape) -> list[RoomFit]:
+    """Of fits that put scan b in about the same place the closest, the closest of all first."""
+    found: list[RoomFit] = []
+    for f in sorted(fits, key=lambda f: -f.closeness):
+        if all(_apart_m(f, g, b.points) > DIFFERENT_M for g in found):
+            found.append(f)
+    return found
 
 
 def _fewer(s: RoomShape) -> RoomShape:
@@ -216,6 +230,21 @@ def _shifts(a: Points, b: Points) -> list[Float[np.ndarray, "2"]]:
         x, y = np.maximum(cell - 3, 0)
         score[x : x + 7, y : y + 7] = -np.inf
     return found
+
+
+def _half_turned(a: RoomShape, b: RoomShape, T_a_b: Pose) -> Pose:
+    """The pose turned by half a turn about the vertical, its middle between the walls put where that of `a` is.
+
+    A rectangular room fits itself so; which it is must not depend on which of the two was begun from.
+    """
+    flat = a.normals[np.abs(a.normals[:, 2]) < UPRIGHT]
+    angle = np.angle(np.exp(4j * np.arctan2(flat[:, 1], flat[:, 0])).sum()) / 4
+    to_walls = Rotation.from_euler("z", -angle).as_matrix()
+    ends = [np.percentile(p @ to_walls.T, (1, 99), axis=0) for p in (a.points, apply_pose(T_a_b, b.points))]
+    here, there = (to_walls.T @ (e.mean(axis=0) * [1, 1, 0]) for e in ends)
+    half = np.diag([-1.0, -1.0, 1.0, 1.0])
+    half[:3, 3] = here - half[:3, :3] @ there
+    return half @ T_a_b
 
 
 def _map(points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "w h"]:

@@ -25,6 +25,7 @@ from more2_jax.tracking.pose_voting import (
     room_misfit,
     with_errors,
 )
+from more2_jax.tracking.room_frame import frame_by_rooms
 from more2_jax.tracking.scan_height import Rooms, Weighed, common_height
 from more2_jax.types import Frame, ObservedObject
 
@@ -58,10 +59,14 @@ def common_frame(
         instance=pairs[:, 1],
     )
     T = most_agreed(votes, motion, lifted)
+    building = is_building(signatures(old), signatures(new))
+    if T is lifted and not building:
+        by_rooms = frame_by_rooms((old, new), (rooms.scene, rooms.scan), votes, motion, lifted)
+        T = lifted if by_rooms is None else by_rooms
     misfit, before = (room_misfit(x, rooms.scene, rooms.scan) for x in (T, lifted))
     if misfit > ROOM_WORSE * before:
         return Frame(T_scene_scan=lifted), weighed
-    if is_building(signatures(old), signatures(new)) and shift_m(T, lifted, votes.center) > ELSEWHERE_M:
+    if building and shift_m(T, lifted, votes.center) > ELSEWHERE_M:
         weighed = sought_there(prior, weighed, matcher, motion, T)
     return Frame(T_scene_scan=T), weighed
 

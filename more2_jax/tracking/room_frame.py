@@ -1,0 +1,87 @@
+"""Where a new scan lies by the rooms themselves: floor, walls and what stayed, laid onto one another.
+
+Beyond the paper (preset `robust`). Where most objects moved, or masks hide that they stayed, few agree on a frame, and
+the room still tells it. But a rectangular room fits itself turned by half a turn: of the poses that fit, the one is
+taken at which most objects lie where they lay.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from more2_jax.config import MotionModel
+from more2_jax.geometry.poses import Points, Pose, apply_pose
+from more2_jax.geometry.room_alignment import (
+    CLEARLY,
+    RoomFit,
+    RoomShape,
+    fit_as_given,
+    fits_from_any_yaw,
+    room_shape,
+)
+from more2_jax.tracking.pose_voting import Votes, agreement
+from more2_jax.types import ObservedObject
+
+LEAST_BACKGROUND = 200  # points: objects alone are no room
+ENOUGH = 2  # objects that agree outweigh how closely the rooms fit
+
+
+def frame_by_rooms(
+    sides: tuple[Sequence[ObservedObject], Sequence[ObservedObject]],
+    rooms: tuple[Points, Points],
+    votes: Votes,
+    motion: MotionModel,
+    given: Pose,
+) -> Pose | None:
+    """`T_scene_scan` of a scan that lies in a frame of its own; None where that is not told, or it fits as given.
+
+    Args:
+        sides: what is known (scene's frame), and the instances of the scan (its own).
+        rooms: the backgrounds of both, z up to about 10°, meters.
+        votes: where pairs that are likely one object would put the scan.
+        motion: upright: the pose turns about the vertical only, and lifts as `given` does.
+        given: the frame that is taken if there is no other.
+    """
+    a, b = (shape_of(*side) for side in zip(rooms, sides, strict=True))
+    if a is None or b is None or fit_as_given(a, b) is not None:
+        return None
+    T = most_likely(fits_from_any_yaw(a, b), votes)
+    return upright(T, b.points, given) if T is not None and motion == "upright" else T
+
+
+def shape_of(background: Points, objects: Sequence[ObservedObject]) -> RoomShape | None:
+    """All of a scan; None where it shows too little of a room, or is too wide to be one."""
+    if len(background) < LEAST_BACKGROUND:
+        return None
+    try:
+        return room_shape(np.concatenate([background, *(o.points for o in objects)]))
+    except ValueError:
+        return None
+
+
+def most_likely(fits: Sequence[RoomFit], votes: Votes) -> Pose | None:
+    """The fit that most objects agree with, then the closest; None where no object does, or another is as likely."""
+    if not len(votes.center):
+        return None
+    ranked = sorted(((agreement(f.T_a_b, votes)[0], f.closeness, f.T_a_b) for f in fits), key=lambda x: x[:2])
+    if not ranked or not ranked[-1][0]:
+        return None
+    agree, closeness, T = ranked[-1]
+    for others, rival, _ in ranked[:-1]:
+        clearly_more = agree >= ENOUGH and others < agree
+        if not clearly_more and rival >= CLEARLY * closeness:
+            return None
+    return T
+
+
+def upright(T: Pose, points: Points, given: Pose) -> Pose:
+    """The pose without its tilt, and at the height of `given`: the middle of the points stays where it put it."""
+    middle, level = points.mean(axis=0), np.eye(4)
+    yaw = np.arctan2(T[1, 0] - T[0, 1], T[0, 0] + T[1, 1])
+    level[:3, :3] = Rotation.from_euler("z", yaw).as_matrix()
+    level[:3, 3] = apply_pose(T, middle) - level[:3, :3] @ middle
+    level[2, 3] = given[2, 3]
+    return level
