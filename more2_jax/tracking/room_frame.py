@@ -23,23 +23,24 @@ from more2_jax.geometry.room_alignment import (
     room_shape,
 )
 from more2_jax.tracking.pose_voting import Votes, agreement
-from more2_jax.types import ObservedObject
+from more2_jax.types import Frame
 
 LEAST_BACKGROUND = 200  # points: objects alone are no room
+OFF_M, OFF_DEG = 0.02, 0.5  # by which such frames are off, in the median: drift bends rooms
 ENOUGH = 2  # objects that agree outweigh how closely the rooms fit
 
 
 def frame_by_rooms(
-    sides: tuple[Sequence[ObservedObject], Sequence[ObservedObject]],
+    sides: tuple[Sequence[Points], Sequence[Points]],
     rooms: tuple[Points, Points],
     votes: Votes,
     motion: MotionModel,
     given: Pose,
-) -> Pose | None:
-    """`T_scene_scan` of a scan that lies in a frame of its own; None where that is not told, or it fits as given.
+) -> Frame | None:
+    """The frame of a scan that does not lie as given; None where it does, or where that is not told.
 
     Args:
-        sides: what is known (scene's frame), and the instances of the scan (its own).
+        sides: clouds of what is known (scene's frame), and of the instances of the scan (its own), meters.
         rooms: the backgrounds of both, z up to about 10°, meters.
         votes: where pairs that are likely one object would put the scan.
         motion: upright: the pose turns about the vertical only, and lifts as `given` does.
@@ -49,15 +50,18 @@ def frame_by_rooms(
     if a is None or b is None or fit_as_given(a, b) is not None:
         return None
     T = most_likely(fits_from_any_yaw(a, b), votes)
-    return upright(T, b.points, given) if T is not None and motion == "upright" else T
+    if T is None:
+        return None
+    T = upright(T, b.points, given) if motion == "upright" else T
+    return Frame(T_scene_scan=T, sigma_m=OFF_M, sigma_deg=OFF_DEG)
 
 
-def shape_of(background: Points, objects: Sequence[ObservedObject]) -> RoomShape | None:
+def shape_of(background: Points, objects: Sequence[Points]) -> RoomShape | None:
     """All of a scan; None where it shows too little of a room, or is too wide to be one."""
     if len(background) < LEAST_BACKGROUND:
         return None
     try:
-        return room_shape(np.concatenate([background, *(o.points for o in objects)]))
+        return room_shape(np.concatenate([background, *objects]))
     except ValueError:
         return None
 
@@ -79,9 +83,9 @@ def most_likely(fits: Sequence[RoomFit], votes: Votes) -> Pose | None:
 
 def upright(T: Pose, points: Points, given: Pose) -> Pose:
     """The pose without its tilt, and at the height of `given`: the middle of the points stays where it put it."""
-    middle, level = points.mean(axis=0), np.eye(4)
+    middle, level = points.mean(axis=0, keepdims=True), np.eye(4)
     yaw = np.arctan2(T[1, 0] - T[0, 1], T[0, 0] + T[1, 1])
     level[:3, :3] = Rotation.from_euler("z", yaw).as_matrix()
-    level[:3, 3] = apply_pose(T, middle) - level[:3, :3] @ middle
+    level[:3, 3] = (apply_pose(T, middle) - apply_pose(level, middle))[0]
     level[2, 3] = given[2, 3]
     return level

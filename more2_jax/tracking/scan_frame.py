@@ -58,11 +58,12 @@ def common_frame(
         object=pairs[:, 0],
         instance=pairs[:, 1],
     )
-    T = most_agreed(votes, motion, lifted)
     building = is_building(signatures(old), signatures(new))
-    if T is lifted and not building:
-        by_rooms = frame_by_rooms((old, new), (rooms.scene, rooms.scan), votes, motion, lifted)
-        T = lifted if by_rooms is None else by_rooms
+    frame = Frame(T_scene_scan=most_agreed(votes, motion, lifted))
+    if frame.T_scene_scan is lifted and not building:
+        clouds = [o.points for o in old], [o.points for o in new]
+        frame = frame_by_rooms(clouds, (rooms.scene, rooms.scan), votes, motion, lifted) or frame
+    T = frame.T_scene_scan
     misfit, before = (room_misfit(x, rooms.scene, rooms.scan) for x in (T, lifted))
     if misfit > ROOM_WORSE * before:
         return Frame(T_scene_scan=lifted), weighed
@@ -70,7 +71,7 @@ def common_frame(
         weighed = sought_there(prior, weighed, matcher, motion, T)
     elif not building and T is not lifted:
         weighed = compared_there(prior, weighed, matcher, motion, T)
-    return Frame(T_scene_scan=T), weighed
+    return frame, weighed
 
 
 def shift_m(T: Pose, other: Pose, points: Points) -> float:

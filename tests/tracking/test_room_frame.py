@@ -1,0 +1,89 @@
+"""The frame of a scan by the rooms: objects say which turn it is; nothing is said where nothing tells."""
+
+import numpy as np
+import pytest
+from factories import turn_z
+from furnished_room import BOXES, box, empty_room
+
+from more2_jax.geometry.poses import apply_pose
+from more2_jax.geometry.room_alignment import RoomFit
+from more2_jax.tracking.pose_voting import Votes
+from more2_jax.tracking.room_frame import OFF_M, frame_by_rooms, most_likely
+
+SIDES_M = (5.0, 3.6)
+AWAY = turn_z(np.deg2rad(67.0), np.zeros(3), np.array([5.0, -3.0, 0.4]))  # T_scan_scene
+HALF_TURN = turn_z(np.pi, np.array([SIDES_M[0] / 2, SIDES_M[1] / 2, 0.0]), np.zeros(3))
+LIFTED = np.eye(4)
+LIFTED[2, 3] = -0.4  # what the heights of AWAY ask for
+EMPTY = np.zeros((0, 3))
+
+
+def objects(seed: int) -> list[np.ndarray]:
+    rng = np.random.default_rng(seed)
+    return [box(rng, *b) for b in BOXES]
+
+
+def votes(T_scene_scan: list[np.ndarray], centers: np.ndarray) -> Votes:
+    """Each pair with one way."""
+    rows = np.arange(len(centers))
+    return Votes(T_scene_scan=np.stack(T_scene_scan)[:, None], center=centers, object=rows, instance=rows)
+
+
+def told(stayed: int, motion="upright", backgrounds=None, away=AWAY):
+    """The frame of a scan in which `stayed` of three boxes say that they stayed, the others that they moved."""
+    before, after = objects(0), [apply_pose(away, o) for o in objects(1)]
+    rooms = backgrounds or (empty_room(SIDES_M, 0), apply_pose(away, empty_room(SIDES_M, 1)))
+    moved = turn_z(1.0, np.zeros(3), np.array([0.7, 0.5, 0.0]))
+    ways = [np.linalg.inv(away) @ (np.eye(4) if k < stayed else moved) for k in range(3)]
+    given = LIFTED if motion == "upright" else np.eye(4)
+    centers = np.stack([o.mean(axis=0) for o in after])
+    return frame_by_rooms((before, after), rooms, votes(ways, centers), motion, given)
+
+
+@pytest.mark.parametrize("motion", ["upright", "free"])
+def test_one_object_that_stayed_tells_which_way_the_room_lies(motion):
+    frame = told(1, motion)
+    assert frame is not None
+    np.testing.assert_allclose(frame.T_scene_scan @ AWAY, np.eye(4), atol=0.02)
+    if motion == "upright":
+        assert frame.T_scene_scan[2, 3] == LIFTED[2, 3]
+        np.testing.assert_array_equal(frame.T_scene_scan[2, :3], [0, 0, 1])
+    assert frame.sigma_m == OFF_M
+
+
+def test_nothing_is_said_where_no_object_stayed_or_rooms_are_not_seen_or_lie_as_given():
+    assert told(0) is None
+    assert told(3, backgrounds=(EMPTY, EMPTY)) is None
+    assert told(3, backgrounds=(empty_room(SIDES_M, 0), EMPTY)) is None
+    assert told(3, away=np.eye(4)) is None
+
+
+def fit(T, closeness) -> RoomFit:
+    return RoomFit(T_a_b=T, share=0.6, closeness=closeness)
+
+
+@pytest.mark.parametrize(
+    ("here", "there", "closeness", "expected"),
+    [
+        (2, 0, (0.8, 1.0), "here"),  # two that agree outweigh how closely rooms fit,
+        (1, 0, (0.8, 1.0), None),  # one does not,
+        (1, 0, (1.0, 0.8), "here"),
+        (1, 0, (1.0, 0.99), None),  # and is not enough where rooms do not tell
+        (2, 2, (1.0, 0.8), "here"),
+        (2, 2, (1.0, 0.99), None),
+        (1, 2, (1.0, 0.8), "there"),
+        (0, 0, (1.0, 0.5), None),
+    ],
+)
+def test_the_turn_that_objects_agree_with_is_taken(here, there, closeness, expected):
+    rng = np.random.default_rng(0)
+    centers = rng.uniform(0, 1, (here + there, 3)) * [2.0, 1.5, 0.5]
+    ways = [np.eye(4)] * here + [HALF_TURN] * there
+    said = votes(ways, centers) if ways else Votes(
+        T_scene_scan=np.zeros((0, 1, 4, 4)), center=EMPTY, object=np.zeros(0, int), instance=np.zeros(0, int)
+    )
+    fits = [fit(np.eye(4), closeness[0]), fit(HALF_TURN, closeness[1])]
+    for order in (fits, fits[::-1]):
+        T = most_likely(order, said)
+        found = None if T is None else "here" if np.array_equal(T, np.eye(4)) else "there"
+        assert found == expected
