@@ -31,6 +31,7 @@ FIGURES = {
     "MR, paper's formula": ("MR", "paper"),
     "MRR": ("MRR", "strict"),
     "F1": ("added and removed, F1", ""),
+    "told whether it moved": ("told whether it moved", "strict"),
     "t-mAP": ("t-mAP", ""),
     "t-AP50": ("t-AP50", ""),
     "median RE": ("MedRE of true pairs", "strict"),

@@ -17,7 +17,7 @@ import jax
 import tyro
 
 from eval.data.truth import KnownScene
-from eval.harness.options import OptionsBeside, benchmark, is_upright, told_upright
+from eval.harness.options import OURS, OptionsBeside, benchmark, is_upright, told_upright
 from eval.harness.program import Program, Summary, carry_out, run_program
 from eval.harness.runs import Run, Work, open_run
 from eval.peers.end_to_end import NAME, combined, without_learning
@@ -61,6 +61,7 @@ def figures() -> list[Figure]:
         *in_columns(replace(share, name="MR", key="mr")),
         *in_columns(replace(share, name="MRR", key="mrr")),
         replace(error, column="strict", better="lower"),
+        replace(share, name="told whether it moved", key="told.strict", column="strict"),
         replace(share, name="added and removed, F1", key="changes_f1", statistic="mean"),
         *(replace(share, name=n, key=k, statistic="average_precision") for n, k in TEMPORAL.items()),
         time,
@@ -150,7 +151,7 @@ def records_of(
     taken = told(clock() - began)
     followed = temporal_records(scene, tracks)
     scene, tracks = with_divided_masks(scene, tracks)
-    pairs = score_tracks(scene, tracks, right_deg, samples)
+    pairs = score_tracks(scene, tracks, right_deg, samples, says_motion=name.startswith(OURS))
     whole: Record = {**taken, "changes_f1": changes_f1(scene, tracks), "reason": reason}
     whole |= followed
     return [{"method": name, **r} for r in [*pairs, whole]]

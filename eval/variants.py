@@ -52,7 +52,17 @@ def main(
     """
     weights = load_prior(prior)
     result = Table(
-        "rooms", "variant", "pairs", "right", "wrong", "RE < 5°", "< 15°", "MR (10°, 10 cm)", "F1", "s"
+        "rooms",
+        "variant",
+        "pairs",
+        "right",
+        "wrong",
+        "RE < 5°",
+        "< 15°",
+        "MR (10°, 10 cm)",
+        "F1",
+        "told",
+        "s",
     )
     for folder in data:
         rooms = flyingshape(folder)
@@ -88,7 +98,7 @@ def row_of(scenes: list[KnownScene], prior: Prior, config: SceneConfig, right_de
         *_, last = living_scenes(scene, prior, config)
         seconds.append(time.process_time() - began)
         scene, tracks = with_divided_masks(scene, tracks_of(last))
-        pairs += score_tracks(scene, tracks, right_deg, 0)
+        pairs += score_tracks(scene, tracks, right_deg, 0, says_motion=True)
         f1.append(changes_f1(scene, tracks))
         wrong += sum(len(t.instance) - 1 for t in tracks)
     right = sum(r["m.strict"] for r in pairs)
@@ -103,6 +113,7 @@ def row_of(scenes: list[KnownScene], prior: Prior, config: SceneConfig, right_de
         f"{np.sum(turn < 15)}",
         f"{100 * registered:.1f} %",
         f"{100 * np.mean(f1):.1f} %",
+        f"{100 * np.mean([r['told.strict'] for r in pairs if 'told.strict' in r]):.1f} %",
         f"{np.mean(seconds[1:] or seconds):.2f}",
     ]
 

@@ -23,6 +23,9 @@ Descending = DescentRegistration | FieldRegistration
 Masks = Literal["true", "merged", "split", "eroded", "wrong", "predicted"]
 
 
+OURS = "ours"  # methods whose names begin so
+
+
 @dataclass(frozen=True, kw_only=True)
 class Options:
     """Which data, which settings, and where results go."""
@@ -88,7 +91,7 @@ class OptionsBeside(Options):
 
     def methods(self, upright: bool | None) -> dict[str, SceneConfig]:
         """What is measured of ours, by name."""
-        found = {f"ours, {name}": preset(name, upright=upright) for name in self.presets}
+        found = {f"{OURS}, {name}": preset(name, upright=upright) for name in self.presets}
         for name, config in list(found.items()) if self.without_descent else ():
             if isinstance(config.registration, Descending):
                 starts = replace(config, registration=undescended(config.registration))

@@ -29,6 +29,7 @@ class Track:
     seen: dict[int, Float[np.ndarray, "n 3"]] = field(
         default_factory=dict
     )  # by scan, its own points, where masks were mended; else those of its instance
+    moved: dict[int, bool] = field(default_factory=dict)  # by scan, since the one before; where that is said
 
 
 def tracks_of(scene: LivingScene) -> list[Track]:
@@ -41,6 +42,7 @@ def tracks_of(scene: LivingScene) -> list[Track]:
             mesh=o.mesh,
             score=min(*(seen.score for seen in o.observations), *came_or_went(scene, o.id), 1.0),
             seen={seen.scan: points_of(o, seen) for seen in o.observations},
+            moved={c.to_scan: o.id in c.moved for c in scene.changes if o.id in c.moved + c.static},
         )
         for o in scene.objects
     ]
@@ -56,10 +58,13 @@ def track_with(tracks: Sequence[Track], scan: int, instance: int) -> Track | Non
     return next((t for t in tracks if t.instance.get(scan) == instance), None)
 
 
-def score_tracks(scene: KnownScene, tracks: Sequence[Track], right_deg: float, samples: int) -> list[Record]:
+def score_tracks(
+    scene: KnownScene, tracks: Sequence[Track], right_deg: float, samples: int, *, says_motion: bool = False
+) -> list[Record]:
     """A record for every true pair (first scan that has an object, each later one): matched, registered, reconstructed.
 
-    As published, objects without a mask do not count at all; in the other columns they have failed.
+    As published, objects without a mask do not count at all; in the other columns they have failed. `says_motion`: the
+    method says what moved and what stayed.
     """
     records = []
     for o in scene.objects:
@@ -68,7 +73,10 @@ def score_tracks(scene: KnownScene, tracks: Sequence[Track], right_deg: float, s
         for k in sorted(o.instance):
             if k > o.first:
                 lost = LOST in (o.instance[o.first], o.instance[k])
-                records.append(pair_record(scene, o, k, track, right_deg, recalled, lost=lost))
+                record = pair_record(
+                    scene, o, k, track, right_deg, recalled, lost=lost, says_motion=says_motion
+                )
+                records.append(record)
     return records
 
 
@@ -81,8 +89,13 @@ def pair_record(
     recalled: dict[str, float] | None,
     *,
     lost: bool,
+    says_motion: bool = False,
 ) -> Record:
-    """One true pair. `mr.*` and `mrr.*` are 1 or 0; the latter only where there is a true mesh."""
+    """One true pair. `mr.*` and `mrr.*` are 1 or 0; the latter only where there is a true mesh.
+
+    `says_motion`: the method says of what it found whether it moved: `told.strict` is then whether that is right, for
+    scans that follow each other.
+    """
     found = track.instance.get(k) if track else None
     other = scene.owner(k, found) if found is not None else None
     scores = failed_pose()
@@ -100,6 +113,8 @@ def pair_record(
         same = other is o if c == "paper" else other is not None and other.copies == o.copies
         error = scores[f"re_deg.{c}"]
         record[f"m.{c}"] = float(same)
+        if c == "strict" and says_motion and o.moved.get(k) is not None and k == o.first + 1:
+            record["told.strict"] = float(same and track is not None and track.moved.get(k) == o.moved[k])
         record[f"mr.{c}"] = float(same and error is not None and error < right_deg)
         if recalled is not None:
             record[f"mrr.{c}"] = record[f"mr.{c}"] * float(recalled[c] > RECONSTRUCTED)

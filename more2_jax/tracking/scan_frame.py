@@ -69,8 +69,6 @@ def common_frame(
         return Frame(T_scene_scan=lifted), weighed
     if building and shift_m(T, lifted, votes.center) > ELSEWHERE_M:
         weighed = sought_there(prior, weighed, matcher, motion, T)
-    elif not building and T is not lifted:
-        weighed = compared_there(prior, weighed, matcher, motion, T)
     return frame, weighed
 
 
@@ -78,16 +76,6 @@ def shift_m(T: Pose, other: Pose, points: Points) -> float:
     """How far apart two frames put the same points, in the median; 0 of none."""
     apart = np.linalg.norm(apply_pose(T, points) - apply_pose(other, points), axis=1)
     return float(np.median(apart)) if len(apart) else 0.0
-
-
-def compared_there(
-    prior: Prior, weighed: Weighed, matcher: EvidenceMatcher, motion: MotionModel, T_scene_scan: Pose
-) -> Weighed:
-    """The pairs of a room anew, "it did not move" being another pose than it was taken for."""
-    new, old = weighed.aligned.sides
-    aligned = align_candidates(prior, old, new, matcher, motion, T_scene_scan, weighed.aligned.seen)
-    odds = odds_of(aligned, matcher.search, motion, weighed.height_m)
-    return Weighed(height_m=weighed.height_m, aligned=aligned, odds=odds)
 
 
 def sought_there(

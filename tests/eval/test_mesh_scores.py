@@ -246,6 +246,32 @@ def test_each_stage_alone_can_fail():
     assert (totals(found, "mr.strict"), totals(found, "mrr.strict")) == ((8, 8), (6, 8))
 
 
+def test_what_is_said_of_motion_counts_for_scans_that_follow_each_other():
+    tracks = [true_track(o) for o in SCENE.objects]
+    known = [dict.fromkeys((1, 2), k % 2 == 0) for k in range(len(tracks))]
+    scene = dataclasses.replace(
+        SCENE,
+        objects=tuple(dataclasses.replace(o, moved=m) for o, m in zip(SCENE.objects, known, strict=True)),
+    )
+    asked = sum(o.first + 1 in o.instance for o in scene.objects)
+
+    def told(said):
+        tracked = [dataclasses.replace(t, moved=m) for t, m in zip(tracks, said, strict=True)]
+        found = score_tracks(scene, tracked, 5.0, 10, says_motion=True)
+        return sum(r.get("told.strict", 0) for r in found), sum("told.strict" in r for r in found)
+
+    assert told(known) == (asked, asked)
+    assert told([{k: not m for k, m in moved.items()} for moved in known]) == (0, asked)
+    assert told([{}] * len(tracks)) == (0, asked)
+    assert told([known[0], *[{}] * (len(tracks) - 1)]) == (1, asked)
+    for said, objects in (
+        (False, scene),
+        (True, SCENE),
+    ):  # a method that says nothing, objects of which none is known
+        records = score_tracks(objects, tracks, 5.0, 10, says_motion=said)
+        assert not any("told.strict" in r for r in records)
+
+
 def test_copies_that_change_places_are_right_but_not_by_name():
     one, other = SCENE.objects[1:3]
     swapped = []

@@ -187,6 +187,7 @@ def test_a_real_program_in_shards(options, tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.optimized  # as the workers compile
 @pytest.mark.parametrize("where", [{"workers": 2}, {"ray": "local", "workers": 1}], ids=["processes", "ray"])
 def test_workers_give_the_same(options, tmp_path, monkeypatch, where):
     """Other processes, the actors of a cluster: the files of scenes are those of this process, but for seconds."""

@@ -35,7 +35,7 @@ def test_figures_count_pairs_and_a_failure_is_neither_near_nor_right(monkeypatch
         instance: dict
 
     def pair(matched, turn, shift):
-        return {"m.strict": matched, "re_deg.strict": turn, "te_m.strict": shift}
+        return {"m.strict": matched, "re_deg.strict": turn, "te_m.strict": shift, "told.strict": matched}
 
     pairs = [pair(1.0, 1.0, 0.01), pair(1.0, 7.0, 0.02), pair(1.0, 1.0, 0.2), pair(0.0, None, None)]
     monkeypatch.setattr(eval.variants, "living_scenes", lambda *_: iter([object()]))
@@ -43,9 +43,11 @@ def test_figures_count_pairs_and_a_failure_is_neither_near_nor_right(monkeypatch
         eval.variants, "tracks_of", lambda _: [FakeTrack({0: 1, 1: 1})] * 6 + [FakeTrack({1: 9})]
     )
     monkeypatch.setattr(eval.variants, "with_divided_masks", lambda scene, tracks: (scene, tracks))
-    monkeypatch.setattr(eval.variants, "score_tracks", lambda *_: pairs)
+    monkeypatch.setattr(eval.variants, "score_tracks", lambda *_, **__: pairs)
     monkeypatch.setattr(eval.variants, "changes_f1", lambda *_: 0.5)
-    count, right, wrong, below_5, below_15, registered, f1, seconds = row_of([object()], None, ROBUST, 5.0)
+    count, right, wrong, below_5, below_15, registered, f1, told, seconds = row_of(
+        [object()], None, ROBUST, 5.0
+    )
     assert (count, right, wrong, below_5, below_15) == ("4", "3", "3", "2", "3")
-    assert (registered, f1) == ("50.0 %", "50.0 %")
+    assert (registered, f1, told) == ("50.0 %", "50.0 %", "75.0 %")
     assert np.isfinite(float(seconds))

@@ -79,8 +79,15 @@ def test_the_turn_that_objects_agree_with_is_taken(here, there, closeness, expec
     rng = np.random.default_rng(0)
     centers = rng.uniform(0, 1, (here + there, 3)) * [2.0, 1.5, 0.5]
     ways = [np.eye(4)] * here + [HALF_TURN] * there
-    said = votes(ways, centers) if ways else Votes(
-        T_scene_scan=np.zeros((0, 1, 4, 4)), center=EMPTY, object=np.zeros(0, int), instance=np.zeros(0, int)
+    said = (
+        votes(ways, centers)
+        if ways
+        else Votes(
+            T_scene_scan=np.zeros((0, 1, 4, 4)),
+            center=EMPTY,
+            object=np.zeros(0, int),
+            instance=np.zeros(0, int),
+        )
     )
     fits = [fit(np.eye(4), closeness[0]), fit(HALF_TURN, closeness[1])]
     for order in (fits, fits[::-1]):
