@@ -29,6 +29,20 @@ from more2_jax.config import SceneConfig, from_dict, preset
 from more2_jax.network.prior import Prior, load_prior
 from train.run.program import run
 
+HEADINGS = (
+    "rooms",
+    "variant",
+    "pairs",
+    "right",
+    "wrong",
+    "RE < 5°",
+    "< 15°",
+    "MR (10°, 10 cm)",
+    "F1",
+    "told",
+    "s",
+)
+
 
 def main(
     data: tuple[Path, ...],
@@ -51,19 +65,7 @@ def main(
         as_is: also measure the preset as it is.
     """
     weights = load_prior(prior)
-    result = Table(
-        "rooms",
-        "variant",
-        "pairs",
-        "right",
-        "wrong",
-        "RE < 5°",
-        "< 15°",
-        "MR (10°, 10 cm)",
-        "F1",
-        "told",
-        "s",
-    )
+    result = Table(*HEADINGS)
     for folder in data:
         rooms = flyingshape(folder)
         known = [rooms.read(n).first_scans(visits) for n in rooms.names[: scenes or None]]
