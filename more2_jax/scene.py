@@ -102,7 +102,7 @@ def who_is_who(
     with stage("encode", len(instances)):
         embeddings = embed(prior, [i.points for i in instances], [i.normals for i in instances])
     masks = Regrouped(objects=list(scene.objects), instances=list(instances), embeddings=embeddings)
-    rooms, first = rooms_of(scene, scan), next_number(scene.objects, scene.scans)
+    rooms = rooms_of(scene, scan)
 
     def compare(masks: Regrouped) -> Compared:
         give_back(len(instances))
@@ -115,10 +115,16 @@ def who_is_who(
         compared = Comparison.of(prior, [o for o, _ in old], new, identified, config)
         return compared and mend(masks, compared)
 
-    regroup = join_parts, partial(divide_merged, first_number=first)
+    def divided(masks: Regrouped, compared: Comparison) -> Regrouped | None:
+        return divide_merged(masks, compared, next_number(masks.objects, scene.scans))
+
+    def divided_again(masks: Regrouped, compared: Comparison) -> Regrouped | None:
+        """What was divided may tell that a mask of the other scan holds two objects as well."""
+        return divided(masks, compared) if masks.halves or len(masks.objects) > len(scene.objects) else None
+
     with stage("match", len(instances)):
         known = compare(masks)
-        for mend in regroup if config.repair_masks else ():
+        for mend in (join_parts, divided, divided_again) if config.repair_masks else ():
             if mended := mended_by(mend, known):
                 del known  # one comparison at a time is in memory
                 known = compare(mended)
