@@ -12,6 +12,7 @@ from factories import scene_object, turn_z
 from furnished import sheet
 from small_scenes import CONFIG, MARK, ROBUST, piece, scan
 
+import more2_jax.scene
 from more2_jax.config import JointConfig, MeshingConfig, preset
 from more2_jax.meshing import engine, object_mesh
 from more2_jax.meshing.object_mesh import object_floor
@@ -19,7 +20,7 @@ from more2_jax.registration import search, surface
 from more2_jax.scene import add_scan, reconstruct, start_scene
 from more2_jax.tracking.accumulated import accumulated_object
 from more2_jax.tracking.changes import moved_probability
-from more2_jax.tracking.objects import points_of
+from more2_jax.tracking.objects import next_number, points_of
 from more2_jax.types import Instance, Mesh, Scan
 
 pytestmark = pytest.mark.optimized  # scenes run for longer than their programs compile
@@ -323,6 +324,24 @@ def test_a_mask_that_holds_two_objects_is_divided_where_another_scan_shows_them_
     assert sum(len(o.points) for o in made.objects) == sum(len(i.points) for v in visits for i in v.instances)
     assert made.scans[merged_scan].instances == tuple(i.id for i in visits[merged_scan].instances)
     assert kept.changes[0].added or kept.changes[0].removed
+
+
+@pytest.mark.parametrize(("merged", "expected"), [(True, [True, False]), (False, [False])])
+def test_masks_are_looked_at_again_where_one_was_divided(tiny_prior, monkeypatch, merged, expected):
+    """Its halves may show that a mask of the other scan holds two things as well."""
+    found = []
+
+    def noted(masks, compared, first_number, divide=more2_jax.scene.divide_merged):
+        divided = divide(masks, compared, first_number)
+        found.append(divided is not None)
+        assert first_number == next_number(masks.objects, ())
+        return divided
+
+    monkeypatch.setattr(more2_jax.scene, "divide_merged", noted)
+    visits = [scan(n, {0: (0.0, 0.0), 1: (0.3, 3.0), 2: (0.1, -3.0)}) for n in "ab"]
+    first = in_one(visits[0]) if merged else visits[0]
+    add_scan(tiny_prior, start_scene(tiny_prior, first, CONFIG), visits[1], CONFIG)
+    assert found == expected
 
 
 def furnished(name: str, seed: int) -> Scan:

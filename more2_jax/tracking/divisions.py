@@ -32,7 +32,7 @@ class LeastGain:
 
 # In any orientation more fits by chance.
 LEAST_GAIN: dict[MotionModel, LeastGain] = {
-    "upright": LeastGain(narrow=2.2, wide=4.0, taken=5.0),
+    "upright": LeastGain(narrow=2.2, wide=4.0, taken=4.0),
     "free": LeastGain(narrow=3.8, wide=5.9, taken=6.8),
 }
 

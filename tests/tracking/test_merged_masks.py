@@ -96,7 +96,7 @@ def test_other_masks_stay_whole(odds, options):
     assert decided(odds, **options) == []
 
 
-@pytest.mark.parametrize(("held", "gain"), [(1.5, 7.5), (-2.0, 9.0), (3.9, 5.1), (4.1, None)])
+@pytest.mark.parametrize(("held", "gain"), [(1.5, 7.5), (-2.0, 9.0), (4.9, 4.1), (5.1, None)])
 def test_a_half_may_take_what_something_else_hardly_is_at_the_cost_of_that(held, gain):
     """The whole has log odds of 1 with the first, its halves of 5 each; another mask has the second."""
     found = decided([[5, -5], [-5, 5]], partner=0, now=1.0, doubtful={1: held})
