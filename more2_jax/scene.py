@@ -118,13 +118,11 @@ def who_is_who(
     def divided(masks: Regrouped, compared: Comparison) -> Regrouped | None:
         return divide_merged(masks, compared, next_number(masks.objects, scene.scans))
 
-    def divided_again(masks: Regrouped, compared: Comparison) -> Regrouped | None:
-        """What was divided may tell that a mask of the other scan holds two objects as well."""
-        return divided(masks, compared) if masks.halves or len(masks.objects) > len(scene.objects) else None
-
+    # Once one is divided, its halves may show that a mask of the other scan holds two objects as well.
+    mends = join_parts, divided, lambda m, compared: divided(m, compared) if m.divided else None
     with stage("match", len(instances)):
         known = compare(masks)
-        for mend in (join_parts, divided, divided_again) if config.repair_masks else ():
+        for mend in mends if config.repair_masks else ():
             if mended := mended_by(mend, known):
                 del known  # one comparison at a time is in memory
                 known = compare(mended)

@@ -28,6 +28,11 @@ class Regrouped:
     joined: tuple[JoinedMask, ...] = ()
     repairs: tuple[Repair, ...] = ()  # of objects
 
+    @property
+    def divided(self) -> bool:
+        """Whether a mask of either scan was."""
+        return bool(self.halves) or any(r.divided for r in self.repairs)
+
     def masks(self, found: Sequence[Found], fresh: Mapping[int, SceneObject]) -> tuple[Repair, ...]:
         """The masks of this scan that were joined or divided. `fresh`: new objects by the rows of their instances."""
         names = {f.instance: self.objects[f.object].id for f in found} | {i: o.id for i, o in fresh.items()}
