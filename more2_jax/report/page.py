@@ -19,7 +19,7 @@ from more2_jax.report.lists import (
     timing_table,
 )
 from more2_jax.report.payload import payload
-from more2_jax.report.wording import leveled_text
+from more2_jax.report.wording import frame_text, leveled_text
 from more2_jax.types import LivingScene
 from more2_jax.whole_file import whole_file
 
@@ -93,7 +93,12 @@ def _summary(scene: LivingScene, names: str) -> str:
     return (
         f"{scans} scan{'' if scans == 1 else 's'} ({names}), {objects} object{'' if objects == 1 else 's'} in all; "
         f"preset {scene.preset}, prior {scene.prior}{', upright' if scene.upright else ''}."
-        + "".join(f" {text}." for s in scene.scans if (text := leveled_text(scene, s)))
+        + "".join(
+            f" {text}."
+            for s in scene.scans
+            for told in (leveled_text, frame_text)
+            if (text := told(scene, s))
+        )
     )
 
 

@@ -7,6 +7,8 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
+import numpy as np
+
 from more2_jax.config import SceneConfig
 from more2_jax.tracking.changes import changes_between, not_seen_in
 from more2_jax.tracking.objects import motion_between, observation_in
@@ -14,6 +16,7 @@ from more2_jax.types import Changes, LivingScene, Observation, Repair, ScanRecor
 
 LOW_SCORE = 0.3  # a match below it is told as unsure; same objects usually score 0.5 to 0.9
 UNLIKELY = 0.6  # as is a change that is less probable than this
+LEAST_TURN_DEG = 2.0  # of a scan's frame against the first one's that is worth telling
 
 Status = Literal["moved", "static", "added", "removed", "not_seen", "present", "absent"]
 STATES: tuple[Status, ...] = ("moved", "added", "removed", "static", "not_seen")
@@ -95,6 +98,24 @@ def leveled_text(scene: LivingScene, scan: ScanRecord) -> str | None:
     """`friday: leveled by 3.2°`; None of a scan that was taken as given, or in a scene that is not upright."""
     tilt_deg = scan.frame.tilt_deg
     return f"{scan.name}: leveled by {tilt_deg:.1f}°" if scene.upright and tilt_deg > 0 else None
+
+
+def frame_text(scene: LivingScene, scan: ScanRecord) -> str | None:
+    """`friday: lies in a frame of its own, turned by 67° against monday`; None of a scan in the scene's.
+
+    Where nothing told how a scan lies, that is said instead.
+    """
+    first = scene.scans[0]
+    if scan.frame.unknown:
+        return (
+            f"{scan.name}: does not lie on {first.name} as given, and nothing tells how it does: its objects are"
+            " matched, but what of them moved, and how far, is not known"
+        )
+    T = np.linalg.inv(first.frame.T_scene_scan) @ scan.frame.T_scene_scan
+    turn_deg = float(np.rad2deg(np.abs(np.arctan2(T[1, 0] - T[0, 1], T[0, 0] + T[1, 1]))))
+    if turn_deg < LEAST_TURN_DEG:
+        return None
+    return f"{scan.name}: lies in a frame of its own, turned by {turn_deg:.0f}° against {first.name}"
 
 
 def repair_text(scan: ScanRecord, repair: Repair) -> str:

@@ -305,7 +305,8 @@ def _frame(content: dict[str, Any] | None) -> Frame:
     if content is None:
         return Frame()
     T = np.array(content["T_scene_scan"], np.float64)
-    return Frame(T_scene_scan=T, sigma_m=content["sigma_m"], sigma_deg=content["sigma_deg"])
+    sigma = {k: content[k] for k in ("sigma_m", "sigma_deg")}
+    return Frame(T_scene_scan=T, unknown=content.get("unknown", False), **sigma)
 
 
 def _object(

@@ -80,6 +80,7 @@ def _frame_to_json(frame: Frame, upright: bool) -> dict[str, Any]:
         "sigma_m": float(frame.sigma_m),
         "sigma_deg": float(frame.sigma_deg),
     }
+    content |= {"unknown": True} if frame.unknown else {}  # older readers know no such frame
     return content | ({"tilt_deg": frame.tilt_deg} if upright and frame.tilt_deg > 0 else {})
 
 

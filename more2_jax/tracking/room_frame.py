@@ -37,7 +37,7 @@ def frame_by_rooms(
     motion: MotionModel,
     given: Pose,
 ) -> Frame | None:
-    """The frame of a scan that does not lie as given; None where it does, or where that is not told.
+    """The frame of a scan that does not lie as given, `unknown` where it is not told; None where it does.
 
     Args:
         sides: clouds of what is known (scene's frame), and of the instances of the scan (its own), meters.
@@ -49,9 +49,10 @@ def frame_by_rooms(
     a, b = (shape_of(*side) for side in zip(rooms, sides, strict=True))
     if a is None or b is None or fit_as_given(a, b) is not None:
         return None
+    as_given = agreement(given, votes)[0]
     T = most_likely(fits_from_any_yaw(a, b), votes)
-    if T is None:
-        return None
+    if T is None or agreement(T, votes)[0] <= as_given:
+        return None if as_given else Frame(T_scene_scan=given, unknown=True)
     T = upright(T, b.points, given) if motion == "upright" else T
     return Frame(T_scene_scan=T, sigma_m=OFF_M, sigma_deg=OFF_DEG)
 

@@ -15,7 +15,7 @@ from skimage.color import rgb2lab
 
 from more2_jax.config import SceneConfig
 from more2_jax.geometry.poses import apply_pose
-from more2_jax.report import color, leveled_text, motion_text, report_html, rgb, write_report
+from more2_jax.report import color, frame_text, leveled_text, motion_text, report_html, rgb, write_report
 from more2_jax.report.blob import Blob
 from more2_jax.report.coverage import coverage
 from more2_jax.report.palette import BASE, ink
@@ -119,6 +119,30 @@ def test_doubts_are_told():
     )
     assert "left out of its shape" in doubtful(accumulated=False).doubts[0]
     assert headline(SCENE, [doubtful(score=0.2)], 0, 1).endswith("1 object moved. 1 of these is unsure.")
+
+
+def in_frames(*frames: Frame):
+    """The scene whose last scans lie so."""
+    scans = [
+        dataclasses.replace(s, frame=f) for s, f in zip(SCENE.scans[-len(frames) :], frames, strict=True)
+    ]
+    return dataclasses.replace(SCENE, scans=(*SCENE.scans[: -len(frames)], *scans))
+
+
+def test_how_a_scan_lies_in_a_frame_of_its_own_is_told_and_where_nothing_tells():
+    turned, little = np.eye(4), np.eye(4)
+    turned[:3, :3] = Rotation.from_euler("zx", [-67.0, 3.0], degrees=True).as_matrix()
+    turned[:3, 3] = [5.0, -3.0, 0.4]
+    little[:3, :3] = Rotation.from_euler("z", 1.0, degrees=True).as_matrix()
+    scene = in_frames(Frame(T_scene_scan=little), Frame(T_scene_scan=turned))
+    told = [frame_text(scene, s) for s in scene.scans]
+    assert told == [None, None, "friday: lies in a frame of its own, turned by 67° against monday"]
+    assert "turned by 67° against monday." in report_html(scene, CONFIG)
+    lost = in_frames(Frame(unknown=True))
+    text = frame_text(lost, lost.scans[-1])
+    assert text is not None and "nothing tells how" in text and text in report_html(lost, CONFIG)
+    both = in_frames(Frame(T_scene_scan=turned), Frame(T_scene_scan=turned))
+    assert frame_text(dataclasses.replace(both, scans=both.scans[1:]), both.scans[-1]) is None  # one frame
 
 
 def test_the_tilt_of_a_leveled_scan_is_told():
