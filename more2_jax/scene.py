@@ -118,7 +118,6 @@ def who_is_who(
     def divided(masks: Regrouped, compared: Comparison) -> Regrouped | None:
         return divide_merged(masks, compared, next_number(masks.objects, scene.scans))
 
-    # Once one is divided, its halves may show that a mask of the other scan holds two objects as well.
     mends = join_parts, divided, lambda m, compared: divided(m, compared) if m.divided else None
     with stage("match", len(instances)):
         known = compare(masks)
