@@ -30,7 +30,7 @@ class Regrouped:
 
     @property
     def divided(self) -> bool:
-        """Whether a mask of either scan was: its halves may show that one of the other scan holds two objects as well."""
+        """Whether a mask of either scan was. Its halves may show that one of the other scan holds two, as well."""
         return bool(self.halves) or any(r.divided for r in self.repairs)
 
     def masks(self, found: Sequence[Found], fresh: Mapping[int, SceneObject]) -> tuple[Repair, ...]:
