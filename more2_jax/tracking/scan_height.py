@@ -47,8 +47,8 @@ class Rooms:
 
 
 def rooms_of(scene: LivingScene, scan: Scan) -> Rooms:
-    """Returns the backgrounds of the scene's last scan and of a new one, both leveled."""
-    last = scene.scans[-1]
+    """Returns the backgrounds of the scene's last scan of a known frame and of a new one, both leveled."""
+    last = next(s for s in reversed(scene.scans) if not s.frame.unknown)  # the first one's is the scene's
     return Rooms(scene=apply_pose(last.frame.T_scene_scan, last.background), scan=scan.background)
 
 

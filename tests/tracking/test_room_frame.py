@@ -1,14 +1,18 @@
 """The frame of a scan by the rooms: objects say which turn it is; nothing is said where nothing tells."""
 
+import dataclasses
+
 import numpy as np
 import pytest
-from factories import turn_z
+from factories import living_scene, turn_z
 from furnished_room import BOXES, box, empty_room
 
 from more2_jax.geometry.poses import apply_pose
 from more2_jax.geometry.room_alignment import RoomFit
 from more2_jax.tracking.pose_voting import Votes
 from more2_jax.tracking.room_frame import OFF_M, frame_by_rooms, most_likely
+from more2_jax.tracking.scan_height import rooms_of
+from more2_jax.types import Frame, Scan
 
 SIDES_M = (5.0, 3.6)
 AWAY = turn_z(np.deg2rad(67.0), np.zeros(3), np.array([5.0, -3.0, 0.4]))  # T_scan_scene
@@ -95,3 +99,16 @@ def test_the_turn_that_objects_agree_with_is_taken(here, there, closeness, expec
         T = most_likely(order, said)
         found = None if T is None else "here" if np.array_equal(T, np.eye(4)) else "there"
         assert found == expected
+
+
+def test_a_scan_that_lies_nobody_knows_how_is_no_room_to_compare_with():
+    scene, points = living_scene(), np.eye(3)
+    lies = (Frame(), Frame(T_scene_scan=AWAY), Frame(unknown=True))
+    scans = [
+        dataclasses.replace(s, background=k * points, frame=f)
+        for k, (s, f) in enumerate(zip(scene.scans, lies, strict=True), 1)
+    ]
+    scene = dataclasses.replace(scene, scans=tuple(scans))
+    found = rooms_of(scene, Scan(name="new", source="new", instances=(), background=7 * points))
+    np.testing.assert_allclose(found.scene, apply_pose(AWAY, 2 * points))
+    np.testing.assert_array_equal(found.scan, 7 * points)
