@@ -284,7 +284,7 @@ class Frame:
     T_scene_scan: Float[np.ndarray, "4 4"] = field(default_factory=lambda: np.eye(4))  # float64, row-major
     sigma_m: float = 0.0  # standard errors of what it makes of a place and of a direction; 0 where it was
     sigma_deg: float = 0.0  # taken as given
-    # As given the scan lies on none before, and nothing tells how it does: what moved, and how far, is not known.
+    # As given the scan does not fit those before, and nothing tells how it lies: what moved, and how far, is in doubt.
     unknown: bool = False
 
     @property

@@ -108,8 +108,8 @@ def frame_text(scene: LivingScene, scan: ScanRecord) -> str | None:
     first = scene.scans[0]
     if scan.frame.unknown:
         return (
-            f"{scan.name}: does not lie on {first.name} as given, and nothing tells how it does: its objects are"
-            " matched, but what of them moved, and how far, is not known"
+            f"{scan.name}: does not fit {first.name} as given, and nothing tells how it lies: its objects are matched,"
+            " but what of them moved, and how far, is in doubt"
         )
     T = np.linalg.inv(first.frame.T_scene_scan) @ scan.frame.T_scene_scan
     turn_deg = float(np.rad2deg(np.abs(np.arctan2(T[1, 0] - T[0, 1], T[0, 0] + T[1, 1]))))

@@ -49,10 +49,11 @@ def frame_by_rooms(
     a, b = (shape_of(*side) for side in zip(rooms, sides, strict=True))
     if a is None or b is None or fit_as_given(a, b) is not None:
         return None
-    as_given = agreement(given, votes)[0]
-    T = most_likely(fits_from_any_yaw(a, b), votes)
-    if T is None or agreement(T, votes)[0] <= as_given:
-        return None if as_given else Frame(T_scene_scan=given, unknown=True)
+    fits, as_given = fits_from_any_yaw(a, b), agreement(given, votes)[0]
+    T = most_likely(fits, votes)
+    if T is None or agreement(T, votes)[0] < as_given:
+        # Rooms that fit at no pose show too little of one another to say that they do not lie as given.
+        return Frame(T_scene_scan=given, unknown=True) if fits and not as_given else None
     T = upright(T, b.points, given) if motion == "upright" else T
     return Frame(T_scene_scan=T, sigma_m=OFF_M, sigma_deg=OFF_DEG)
 
