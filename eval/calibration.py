@@ -39,8 +39,8 @@ from more2_jax.scene import (
     usable,
     without_floor_and_walls,
 )
+from more2_jax.tracking.rooms import Rooms, rooms_of
 from more2_jax.tracking.scan_frame import common_frame
-from more2_jax.tracking.scan_height import Rooms, rooms_of
 from more2_jax.types import ObservedObject
 from train.run.program import run
 

@@ -147,7 +147,8 @@ NAMES = {
         "more2_jax.geometry.floor": "LAYER_M floor_height",
         "more2_jax.geometry.poses": "lift",
         "more2_jax.geometry.transform": "moved moved_embedding",
-        "more2_jax.tracking.scan_height": "AS_GOOD_VOTES CLEARLY LEAST_M Rooms SPREAD_M "
+        "more2_jax.tracking.rooms": "Rooms",
+        "more2_jax.tracking.scan_height": "AS_GOOD_VOTES CLEARLY LEAST_M SPREAD_M "
         "best_vote common_height doubtful height_votes support",
     },
     "objects": {

@@ -36,7 +36,7 @@ from more2_jax.tracking.objects import SCENE_FRAME, accumulated, new_objects, ne
 from more2_jax.tracking.regrouped import Regrouped
 from more2_jax.tracking.relocalize import known_object, relocalize, with_observations
 from more2_jax.tracking.room_points import Cleared, remembered, without_room
-from more2_jax.tracking.scan_height import rooms_of
+from more2_jax.tracking.rooms import rooms_of
 from more2_jax.tracking.split_masks import mend_splits
 from more2_jax.tracking.surroundings import surroundings, surroundings_of_objects
 from more2_jax.types import (

@@ -17,8 +17,8 @@ from more2_jax.matching.code_assignment import match_instances
 from more2_jax.network.embedding_batch import stack
 from more2_jax.network.prior import Prior
 from more2_jax.tracking.objects import SCENE_FRAME
+from more2_jax.tracking.rooms import Rooms
 from more2_jax.tracking.scan_frame import common_frame
-from more2_jax.tracking.scan_height import Rooms
 from more2_jax.types import Frame, ObservedObject, SceneObject
 
 NO_ROOMS = Rooms()

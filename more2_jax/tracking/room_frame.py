@@ -14,58 +14,31 @@ from scipy.spatial.transform import Rotation
 
 from more2_jax.config import MotionModel
 from more2_jax.geometry.poses import Points, Pose, apply_pose
-from more2_jax.geometry.room_alignment import (
-    CLEARLY,
-    RoomFit,
-    RoomShape,
-    fit_as_given,
-    fits_from_any_yaw,
-    room_shape,
-)
+from more2_jax.geometry.room_alignment import CLEARLY, RoomFit
 from more2_jax.tracking.pose_voting import Votes, agreement
+from more2_jax.tracking.rooms import Rooms
 from more2_jax.types import Frame
 
-LEAST_BACKGROUND = 200  # points: objects alone are no room
 OFF_M, OFF_DEG = 0.02, 0.5  # by which such frames are off, in the median: drift bends rooms
 ENOUGH = 2  # objects that agree outweigh how closely the rooms fit
 
 
-def frame_by_rooms(
-    sides: tuple[Sequence[Points], Sequence[Points]],
-    rooms: tuple[Points, Points],
-    votes: Votes,
-    motion: MotionModel,
-    given: Pose,
-) -> Frame | None:
-    """The frame of a scan that does not lie as given, `unknown` where it is not told; None where it does.
+def frame_by_rooms(rooms: Rooms, votes: Votes, motion: MotionModel, given: Pose) -> Frame | None:
+    """The frame of a scan that does not lie as given, `unknown` where it is not told; None where nothing says so.
 
     Args:
-        sides: clouds of what is known (scene's frame), and of the instances of the scan (its own), meters.
-        rooms: the backgrounds of both, z up to about 10°, meters.
+        rooms: both, z up to about 10°.
         votes: where pairs that are likely one object would put the scan.
         motion: upright: the pose turns about the vertical only, and lifts as `given` does.
         given: the frame that is taken if there is no other.
     """
-    a, b = (shape_of(*side) for side in zip(rooms, sides, strict=True))
-    if a is None or b is None or fit_as_given(a, b) is not None:
+    if not rooms.fits:
         return None
-    fits, as_given = fits_from_any_yaw(a, b), agreement(given, votes)[0]
-    T = most_likely(fits, votes)
+    T, as_given = most_likely(rooms.fits, votes), agreement(given, votes)[0]
     if T is None or agreement(T, votes)[0] < as_given:
-        # Rooms that fit at no pose show too little of one another to say that they do not lie as given.
-        return Frame(T_scene_scan=given, unknown=True) if fits and not as_given else None
-    T = upright(T, b.points, given) if motion == "upright" else T
+        return None if as_given else Frame(T_scene_scan=given, unknown=True)
+    T = upright(T, rooms.scan, given) if motion == "upright" else T
     return Frame(T_scene_scan=T, sigma_m=OFF_M, sigma_deg=OFF_DEG)
-
-
-def shape_of(background: Points, objects: Sequence[Points]) -> RoomShape | None:
-    """All of a scan; None where it shows too little of a room, or is too wide to be one."""
-    if len(background) < LEAST_BACKGROUND:
-        return None
-    try:
-        return room_shape(np.concatenate([background, *objects]))
-    except ValueError:
-        return None
 
 
 def most_likely(fits: Sequence[RoomFit], votes: Votes) -> Pose | None:

@@ -26,7 +26,8 @@ from more2_jax.tracking.pose_voting import (
     with_errors,
 )
 from more2_jax.tracking.room_frame import frame_by_rooms
-from more2_jax.tracking.scan_height import Rooms, Weighed, common_height
+from more2_jax.tracking.rooms import Rooms
+from more2_jax.tracking.scan_height import Weighed, common_height
 from more2_jax.types import Frame, ObservedObject
 
 GIVEN_M = 0.01  # by more than this a frame as given is off where another takes its place,
@@ -61,8 +62,7 @@ def common_frame(
     building = is_building(signatures(old), signatures(new))
     frame = Frame(T_scene_scan=most_agreed(votes, motion, lifted))
     if frame.T_scene_scan is lifted and not building:
-        clouds = [o.points for o in old], [o.points for o in new]
-        frame = frame_by_rooms(clouds, (rooms.scene, rooms.scan), votes, motion, lifted) or frame
+        frame = frame_by_rooms(rooms, votes, motion, lifted) or frame
     T = frame.T_scene_scan
     misfit, before = (room_misfit(x, rooms.scene, rooms.scan) for x in (T, lifted))
     if misfit > ROOM_WORSE * before:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -11,7 +11,7 @@ from jaxtyping import Float, Int
 
 from more2_jax.config import EvidenceMatcher
 from more2_jax.geometry.floor import floor_height
-from more2_jax.geometry.poses import Points, apply_pose, vertical_shift
+from more2_jax.geometry.poses import vertical_shift
 from more2_jax.matching.assignment import LogOdds, assign
 from more2_jax.matching.candidates import (
     AlignedPairs,
@@ -23,7 +23,8 @@ from more2_jax.matching.candidates import (
 from more2_jax.matching.metric_evidence import seen_in
 from more2_jax.matching.proposals import likeliest, signatures
 from more2_jax.network.prior import Prior
-from more2_jax.types import LivingScene, ObservedObject, Scan
+from more2_jax.tracking.rooms import Rooms
+from more2_jax.types import ObservedObject
 
 SPREAD_M = 0.015  # of the votes for a height
 VOTERS = 32  # partners of an object that vote: the next has 2⁻³² of the first one's weight
@@ -36,20 +37,6 @@ FLOORS_APART_M = (
     0.05  # floors at other heights than these are seen apart: the lift between them is then expected
 )
 OUT_OF_REACH_M = 0.1  # an alignment begun at another height finds its own from nearer than this
-
-
-@dataclass(frozen=True, kw_only=True)
-class Rooms:
-    """What is not an instance, of the scene so far (scene's frame) and of the new scan (its own), meters."""
-
-    scene: Points = field(default_factory=lambda: np.zeros((0, 3)))
-    scan: Points = field(default_factory=lambda: np.zeros((0, 3)))
-
-
-def rooms_of(scene: LivingScene, scan: Scan) -> Rooms:
-    """Returns the backgrounds of the scene's last scan of a known frame and of a new one, both leveled."""
-    last = next(s for s in reversed(scene.scans) if not s.frame.unknown)  # the first one's is the scene's
-    return Rooms(scene=apply_pose(last.frame.T_scene_scan, last.background), scan=scan.background)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -11,7 +11,7 @@ from more2_jax.geometry.poses import apply_pose
 from more2_jax.geometry.room_alignment import RoomFit
 from more2_jax.tracking.pose_voting import Votes
 from more2_jax.tracking.room_frame import OFF_M, frame_by_rooms, most_likely
-from more2_jax.tracking.scan_height import rooms_of
+from more2_jax.tracking.rooms import Rooms, rooms_of
 from more2_jax.types import Frame, Scan
 
 SIDES_M = (5.0, 3.6)
@@ -41,7 +41,8 @@ def told(stayed: int, motion="upright", backgrounds=None, away=AWAY):
     ways = [np.linalg.inv(away) @ (np.eye(4) if k < stayed else moved) for k in range(3)]
     given = LIFTED if motion == "upright" else np.eye(4)
     centers = np.stack([o.mean(axis=0) for o in after])
-    return frame_by_rooms((before, after), rooms, votes(ways, centers), motion, given)
+    known = Rooms(scene=rooms[0], scan=rooms[1], objects=before, instances=after)
+    return frame_by_rooms(known, votes(ways, centers), motion, given)
 
 
 @pytest.mark.parametrize("motion", ["upright", "free"])

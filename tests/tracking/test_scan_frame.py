@@ -16,8 +16,9 @@ from more2_jax.matching.candidates import AlignedPairs
 from more2_jax.network.embedding_batch import embed
 from more2_jax.scene import add_scan, start_scene
 from more2_jax.tracking.objects import motion_between
+from more2_jax.tracking.rooms import Rooms
 from more2_jax.tracking.scan_frame import sought_there
-from more2_jax.tracking.scan_height import Rooms, Weighed, best_vote, common_height, doubtful
+from more2_jax.tracking.scan_height import Weighed, best_vote, common_height, doubtful
 from more2_jax.types import Instance, LivingScene, ObservedObject, Scan
 
 pytestmark = pytest.mark.optimized  # scenes run for longer than their programs compile

@@ -1,0 +1,63 @@
+"""Two rooms as wholes: what is not an instance, and how all of both fits where it does not lie as given."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+
+from more2_jax.geometry.poses import Points, apply_pose
+from more2_jax.geometry.room_alignment import RoomFit, RoomShape, fit_as_given, fits_from_any_yaw, room_shape
+from more2_jax.tracking.objects import accumulated_points, place_of
+from more2_jax.types import LivingScene, Scan
+
+LEAST_BACKGROUND = 200  # points: objects alone are no room
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rooms:
+    """The scene so far (scene's frame) and a new scan (its own): backgrounds, and clouds of all else, meters."""
+
+    scene: Points = field(default_factory=lambda: np.zeros((0, 3)))
+    scan: Points = field(default_factory=lambda: np.zeros((0, 3)))
+    objects: Sequence[Points] = ()  # of the scene
+    instances: Sequence[Points] = ()  # of the scan
+
+    @cached_property
+    def shapes(self) -> tuple[RoomShape | None, RoomShape | None]:
+        """All of either at even spacing; None where it shows too little of a room."""
+        return shape_of(self.scene, self.objects), shape_of(self.scan, self.instances)
+
+    @cached_property
+    def fits(self) -> list[RoomFit]:
+        """The poses of the scan at which the rooms fit; none where they do as they are given, or one shows too little.
+
+        Whatever masks are joined and divided, these stay.
+        """
+        a, b = self.shapes
+        if a is None or b is None or fit_as_given(a, b) is not None:
+            return []
+        return fits_from_any_yaw(a, b)
+
+
+def shape_of(background: Points, clouds: Sequence[Points]) -> RoomShape | None:
+    """What is compared of a scan; None where it shows too little of a room, or is too wide to be one."""
+    if len(background) < LEAST_BACKGROUND:
+        return None
+    try:
+        return room_shape(np.concatenate([background, *clouds]))
+    except ValueError:
+        return None
+
+
+def rooms_of(scene: LivingScene, scan: Scan) -> Rooms:
+    """The scene as its last scan of a known frame shows it, and a new one, both leveled; objects where seen last."""
+    last = next(s for s in reversed(scene.scans) if not s.frame.unknown)  # the first one's is the scene's
+    return Rooms(
+        scene=apply_pose(last.frame.T_scene_scan, last.background),
+        scan=scan.background,
+        objects=[apply_pose(place_of(o.observations[-1]), accumulated_points(o)) for o in scene.objects],
+        instances=[i.points for i in scan.instances],
+    )
