@@ -14,12 +14,13 @@ from scipy.spatial.transform import Rotation
 
 from more2_jax.config import MotionModel
 from more2_jax.geometry.poses import Points, Pose, apply_pose
-from more2_jax.geometry.room_alignment import CLEARLY, RoomFit
+from more2_jax.geometry.room_alignment import CLEARLY, DIFFERENT_M, RoomFit
 from more2_jax.tracking.pose_voting import Votes, agreement
 from more2_jax.tracking.rooms import Rooms
 from more2_jax.types import Frame
 
 OFF_M, OFF_DEG = 0.02, 0.5  # by which such frames are off, in the median: drift bends rooms
+ALONE = 5  # objects that agree on a frame at which the rooms do not fit; three of ten may by chance
 ENOUGH = 2  # objects that agree outweigh how closely the rooms fit
 
 
@@ -39,6 +40,16 @@ def frame_by_rooms(rooms: Rooms, votes: Votes, motion: MotionModel, given: Pose)
         return None if as_given else Frame(T_scene_scan=given, unknown=True)
     T = upright(T, rooms.scan, given) if motion == "upright" else T
     return Frame(T_scene_scan=T, sigma_m=OFF_M, sigma_deg=OFF_DEG)
+
+
+def borne_out(T_scene_scan: Pose, rooms: Rooms, votes: Votes) -> bool:
+    """Whether rooms, where they fit at some poses, fit at this one, or too many objects agree on it for chance."""
+    if not rooms.fits or agreement(T_scene_scan, votes)[0] >= ALONE:
+        return True
+    some = rooms.scan[:: max(1, len(rooms.scan) // 100)]
+    here = apply_pose(T_scene_scan, some)
+    apart_m = [np.linalg.norm(apply_pose(f.T_a_b, some) - here, axis=1).mean() for f in rooms.fits]
+    return min(apart_m) < DIFFERENT_M
 
 
 def most_likely(fits: Sequence[RoomFit], votes: Votes) -> Pose | None:

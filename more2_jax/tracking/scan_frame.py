@@ -25,7 +25,7 @@ from more2_jax.tracking.pose_voting import (
     room_misfit,
     with_errors,
 )
-from more2_jax.tracking.room_frame import frame_by_rooms
+from more2_jax.tracking.room_frame import borne_out, frame_by_rooms
 from more2_jax.tracking.rooms import Rooms
 from more2_jax.tracking.scan_height import Weighed, common_height
 from more2_jax.types import Frame, ObservedObject
@@ -61,8 +61,8 @@ def common_frame(
     )
     building = is_building(signatures(old), signatures(new))
     frame = Frame(T_scene_scan=most_agreed(votes, motion, lifted))
-    if frame.T_scene_scan is lifted and not building:
-        frame = frame_by_rooms(rooms, votes, motion, lifted) or frame
+    if not building and (frame.T_scene_scan is lifted or not borne_out(frame.T_scene_scan, rooms, votes)):
+        frame = frame_by_rooms(rooms, votes, motion, lifted) or Frame(T_scene_scan=lifted)
     T = frame.T_scene_scan
     misfit, before = (room_misfit(x, rooms.scene, rooms.scan) for x in (T, lifted))
     if misfit > ROOM_WORSE * before:

@@ -10,7 +10,7 @@ from furnished_room import BOXES, box, empty_room
 from more2_jax.geometry.poses import apply_pose
 from more2_jax.geometry.room_alignment import RoomFit
 from more2_jax.tracking.pose_voting import Votes
-from more2_jax.tracking.room_frame import OFF_M, frame_by_rooms, most_likely
+from more2_jax.tracking.room_frame import ALONE, OFF_M, borne_out, frame_by_rooms, most_likely
 from more2_jax.tracking.rooms import Rooms, rooms_of
 from more2_jax.types import Frame, Scan
 
@@ -113,3 +113,21 @@ def test_a_scan_that_lies_nobody_knows_how_is_no_room_to_compare_with():
     found = rooms_of(scene, Scan(name="new", source="new", instances=(), background=7 * points))
     np.testing.assert_allclose(found.scene, apply_pose(AWAY, 2 * points))
     np.testing.assert_array_equal(found.scan, 7 * points)
+
+
+@pytest.mark.parametrize(
+    ("T", "count", "expected"),
+    [
+        (np.eye(4), 3, True),  # where the rooms fit
+        (turn_z(0.02, np.zeros(3), np.array([0.05, 0, 0])), 3, True),
+        (turn_z(1.0, np.zeros(3), np.zeros(3)), 3, False),  # three by chance
+        (turn_z(1.0, np.zeros(3), np.zeros(3)), ALONE, True),
+    ],
+)
+def test_a_vote_at_which_rooms_do_not_fit_needs_more_objects(T, count, expected):
+    centers = np.random.default_rng(0).uniform(0, 2, (count, 3))
+    rooms = Rooms(scan=empty_room(SIDES_M, 1))
+    vars(rooms)["fits"] = [fit(np.eye(4), 1.0), fit(HALF_TURN, 0.9)]  # as if worked out
+    assert borne_out(T, rooms, votes([T] * count, centers)) is expected
+    vars(rooms)["fits"] = []  # rooms that say nothing contradict nothing
+    assert borne_out(T, rooms, votes([T] * count, centers))
