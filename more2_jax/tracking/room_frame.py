@@ -49,7 +49,7 @@ def borne_out(T_scene_scan: Pose, rooms: Rooms, votes: Votes) -> bool:
     some = rooms.scan[:: max(1, len(rooms.scan) // 100)]
     here = apply_pose(T_scene_scan, some)
     apart_m = [np.linalg.norm(apply_pose(f.T_a_b, some) - here, axis=1).mean() for f in rooms.fits]
-    return min(apart_m) < DIFFERENT_M
+    return bool(min(apart_m) < DIFFERENT_M)
 
 
 def most_likely(fits: Sequence[RoomFit], votes: Votes) -> Pose | None:
