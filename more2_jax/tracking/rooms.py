@@ -14,6 +14,7 @@ from more2_jax.tracking.objects import accumulated_points, place_of
 from more2_jax.types import LivingScene, Scan
 
 LEAST_BACKGROUND = 200  # points: objects alone are no room
+WIDEST_M = 100.0  # so are wider scans, or what strays from one
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,10 +47,8 @@ def shape_of(background: Points, clouds: Sequence[Points]) -> RoomShape | None:
     """What is compared of a scan; None where it shows too little of a room, or is too wide to be one."""
     if len(background) < LEAST_BACKGROUND:
         return None
-    try:
-        return room_shape(np.concatenate([background, *clouds]))
-    except ValueError:
-        return None
+    points = np.concatenate([background, *clouds])
+    return room_shape(points) if np.ptp(points, axis=0).max() < WIDEST_M else None
 
 
 def rooms_of(scene: LivingScene, scan: Scan) -> Rooms:

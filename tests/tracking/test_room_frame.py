@@ -62,6 +62,8 @@ def test_nothing_is_said_where_no_object_stayed_or_rooms_are_not_seen_or_lie_as_
     assert told(3, backgrounds=(EMPTY, EMPTY)) is None
     assert told(3, backgrounds=(empty_room(SIDES_M, 0), EMPTY)) is None
     assert told(3, away=np.eye(4)) is None
+    strays = np.concatenate([empty_room(SIDES_M, 0), [[500.0, 0, 0]]])
+    assert told(3, backgrounds=(strays, empty_room(SIDES_M, 1))) is None
 
 
 def fit(T, closeness) -> RoomFit:
