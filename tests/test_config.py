@@ -26,7 +26,7 @@ from more2_jax.config import (
 from train.run.settings import TrainingRun
 
 
-@pytest.mark.parametrize("path", sorted((ROOT / "configs").glob("*.yaml")), ids=lambda p: p.stem)
+@pytest.mark.parametrize("path", sorted((ROOT / "configs").rglob("*.yaml")), ids=lambda p: p.stem)
 def test_shipped_configurations_load_and_round_trip(path, tmp_path):
     run = load_config(path, TrainingRun)
     copy = tmp_path / "copy.yaml"

@@ -144,7 +144,7 @@ def test_only_the_library_is_packaged():
     assert SETTINGS["hatch"]["build"]["targets"]["wheel"]["packages"] == ["more2_jax"]
 
 
-@pytest.mark.parametrize("path", [*ALL_FILES, *sorted((ROOT / "configs").glob("*.yaml"))], ids=name_of)
+@pytest.mark.parametrize("path", [*ALL_FILES, *sorted((ROOT / "configs").rglob("*.yaml"))], ids=name_of)
 def test_no_absolute_paths(path):
     text = path.read_text(encoding="utf-8")
     assert re.findall(r"(?<![\w.<])/(?:home|root|work|Users|mnt|tmp|opt|var)/", text) == []
