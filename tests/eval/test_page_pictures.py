@@ -1,11 +1,12 @@
 """The pictures of README and guide are taken from a page in a real browser, each in its size."""
 
+import pytest
 from page_browser import in_a_browser
 from PIL import Image
 
 from eval.page_pictures import SHOTS, main
 
-pytestmark = in_a_browser
+pytestmark = [in_a_browser, pytest.mark.slow]
 
 
 def test_every_picture_is_taken_and_shows_more_than_one_color(report, tmp_path):

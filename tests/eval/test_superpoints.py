@@ -28,6 +28,7 @@ def network():
     return jax.jit(partial(made.apply, params))
 
 
+@pytest.mark.slow
 @pytest.mark.optimized
 def test_turning_about_the_vertical_changes_no_feature_and_tilting_does(network):
     here, other = network(CLOUD, REAL, CLOUD, REAL)

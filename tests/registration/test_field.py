@@ -67,7 +67,7 @@ def assert_recovered(found, poses, clouds):
         assert degrees < DEGREES and meters < SHARE * pieces.size(cloud)
 
 
-@pytest.mark.parametrize("motion", ["upright", "free"])
+@pytest.mark.parametrize("motion", ["upright", pytest.param("free", marks=pytest.mark.slow)])
 def test_registering_x_to_tx_recovers_t_from_starts_that_are_off(prior, clouds, motion):
     rng = np.random.default_rng(1)
     poses = [pieces.random_pose(rng, upright=motion == "upright") for _ in clouds]

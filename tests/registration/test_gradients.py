@@ -124,8 +124,6 @@ METHODS = {
     "surface without candidates": (SURFACE, None),
 }
 CASES = list(itertools.product(METHODS, ["source", "target"]))
-# The longest way; descent from either cloud is compiled above, and what is left is traced, and slow.
-COMPILED = [CASES[4]]
 
 
 def slopes_of_one(prior, clouds, method, moved):
@@ -144,10 +142,8 @@ def slopes_of_one(prior, clouds, method, moved):
     return of_one, both[moved == "target"], slopes
 
 
-@pytest.mark.parametrize(
-    ("method", "moved"),
-    [pytest.param(*c, marks=[pytest.mark.slow] * (c not in COMPILED)) for c in CASES],
-)
+@pytest.mark.slow  # all are traced below, and the longest ways compiled above
+@pytest.mark.parametrize(("method", "moved"), CASES)
 def test_both_modes_agree_whichever_cloud_is_traced(tiny_prior, clouds, method, moved):
     """The other cloud and both codes are constants of the program."""
     of_one, cloud, slopes = slopes_of_one(tiny_prior, clouds, method, moved)
@@ -158,7 +154,7 @@ def test_both_modes_agree_whichever_cloud_is_traced(tiny_prior, clouds, method, 
     assert float(value) == pytest.approx(float(of_one(cloud)), rel=1e-3)
 
 
-@pytest.mark.parametrize(("method", "moved"), [c for c in CASES if c not in COMPILED])
+@pytest.mark.parametrize(("method", "moved"), CASES)
 def test_both_modes_take_either_cloud(tiny_prior, clouds, method, moved):
     """Traced, not compiled: no constant and no rule of differentiation stands in the way."""
     _, cloud, slopes = slopes_of_one(tiny_prior, clouds, method, moved)

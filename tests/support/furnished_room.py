@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 NOISE_M = 0.003
-PER_M2 = 800
+PER_M2 = 500
 BOXES = [
     ([0.9, 2.7, 0.5], [1.0, 0.8, 1.0]),
     ([3.9, 0.7, 0.3], [0.7, 0.5, 0.6]),

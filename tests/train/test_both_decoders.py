@@ -99,6 +99,7 @@ def test_both_go_on_from_weights_that_have_both_and_from_no_others(both, tmp_pat
         started_warm(both.config, str(tmp_path / "one.npz"), "mine")
 
 
+@pytest.mark.slow
 def test_validation_scores_both(both, tmp_path, training):
     val = load_mix([sphere_shards(tmp_path)], "train")[0]
     eight = jax.tree.map(lambda x: jnp.concatenate([x] * 8)[:8], val)
