@@ -6,7 +6,7 @@ from PIL import Image
 
 from eval.page_pictures import SHOTS, main
 
-pytestmark = [in_a_browser, pytest.mark.slow]
+pytestmark = [*in_a_browser, pytest.mark.slow]
 
 
 def test_every_picture_is_taken_and_shows_more_than_one_color(report, tmp_path):
