@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from eval.docs_chart import draw
+from eval.harness.options import OURS
 from train.run.program import run
 
 DOCS = Path("docs")
@@ -85,7 +86,6 @@ SENSE = {"higher": 1.0, "lower": -1.0}
 # What programs count, where it is not pairs.
 COUNTED = {"reconstruction": "objects", "segmentation": "objects"}
 NO_RIVALS = ("bfloat16", "building", "survival")  # programs whose lines are not methods
-OURS = "ours"  # methods whose names begin so
 
 
 def main(keep: Path | None = None, name: str = "", docs: Path = DOCS) -> None:

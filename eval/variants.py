@@ -115,7 +115,7 @@ def row_of(scenes: list[KnownScene], prior: Prior, config: SceneConfig, right_de
         f"{np.sum(turn < 15)}",
         f"{100 * registered:.1f} %",
         f"{100 * np.mean(f1):.1f} %",
-        f"{100 * np.mean([r['told.strict'] for r in pairs if 'told.strict' in r]):.1f} %",
+        f"{100 * np.mean([r['told.strict'] for r in pairs if 'told.strict' in r] or [np.nan]):.1f} %",
         f"{np.mean(seconds[1:] or seconds):.2f}",
     ]
 

@@ -21,8 +21,6 @@ from more2_jax.config import (
 
 Descending = DescentRegistration | FieldRegistration
 Masks = Literal["true", "merged", "split", "eroded", "wrong", "predicted"]
-
-
 OURS = "ours"  # methods whose names begin so
 
 

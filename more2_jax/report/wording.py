@@ -12,6 +12,7 @@ import numpy as np
 from more2_jax.config import SceneConfig
 from more2_jax.tracking.changes import changes_between, not_seen_in
 from more2_jax.tracking.objects import motion_between, observation_in
+from more2_jax.tracking.pose_voting import turns_deg
 from more2_jax.types import Changes, LivingScene, Observation, Repair, ScanRecord, SceneObject
 
 LOW_SCORE = 0.3  # a match below it is told as unsure; same objects usually score 0.5 to 0.9
@@ -112,7 +113,8 @@ def frame_text(scene: LivingScene, scan: ScanRecord) -> str | None:
             " but what of them moved, and how far, is in doubt"
         )
     T = np.linalg.inv(first.frame.T_scene_scan) @ scan.frame.T_scene_scan
-    turn_deg = float(np.rad2deg(np.abs(np.arctan2(T[1, 0] - T[0, 1], T[0, 0] + T[1, 1]))))
+    yaw = np.abs(np.arctan2(T[1, 0] - T[0, 1], T[0, 0] + T[1, 1]))  # each scan's tilt is told by itself
+    turn_deg = float(np.rad2deg(yaw) if scene.upright else turns_deg(T[None, :3, :3], np.eye(3))[0])
     if turn_deg < LEAST_TURN_DEG:
         return None
     return f"{scan.name}: lies in a frame of its own, turned by {turn_deg:.0f}° against {first.name}"

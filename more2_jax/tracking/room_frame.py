@@ -20,7 +20,7 @@ from more2_jax.tracking.rooms import Rooms
 from more2_jax.types import Frame
 
 OFF_M, OFF_DEG = 0.02, 0.5  # by which such frames are off, in the median: drift bends rooms
-ALONE = 5  # objects that agree on a frame at which the rooms do not fit; three of ten may by chance
+ALONE = 5  # objects that agree on a frame at which the rooms do not fit; three did by chance
 ENOUGH = 2  # objects that agree outweigh how closely the rooms fit
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -10,8 +10,8 @@ import numpy as np
 
 from more2_jax.geometry.poses import Points, apply_pose
 from more2_jax.geometry.room_alignment import RoomFit, RoomShape, fit_as_given, fits_from_any_yaw, room_shape
-from more2_jax.tracking.objects import accumulated_points, place_of
-from more2_jax.types import LivingScene, Scan
+from more2_jax.tracking.looked_at import last_place
+from more2_jax.types import Instance, LivingScene, Scan, SceneObject
 
 LEAST_BACKGROUND = 200  # points: objects alone are no room
 WIDEST_M = 100.0  # so are wider scans, or what strays from one
@@ -19,17 +19,23 @@ WIDEST_M = 100.0  # so are wider scans, or what strays from one
 
 @dataclass(frozen=True, kw_only=True)
 class Rooms:
-    """The scene so far (scene's frame) and a new scan (its own): backgrounds, and clouds of all else, meters."""
+    """The scene so far (scene's frame) and a new scan (its own): backgrounds, meters, and all else.
+
+    Objects are placed only where rooms are compared: those of a building would take as much memory again.
+    """
 
     scene: Points = field(default_factory=lambda: np.zeros((0, 3)))
     scan: Points = field(default_factory=lambda: np.zeros((0, 3)))
-    objects: Sequence[Points] = ()  # of the scene
-    instances: Sequence[Points] = ()  # of the scan
+    objects: Sequence[SceneObject] = ()
+    instances: Sequence[Instance] = ()
 
     @cached_property
     def shapes(self) -> tuple[RoomShape | None, RoomShape | None]:
         """All of either at even spacing; None where it shows too little of a room."""
-        return shape_of(self.scene, self.objects), shape_of(self.scan, self.instances)
+        return (
+            shape_of(self.scene, map(last_place, self.objects)),
+            shape_of(self.scan, (i.points for i in self.instances)),
+        )
 
     @cached_property
     def fits(self) -> list[RoomFit]:
@@ -43,7 +49,7 @@ class Rooms:
         return fits_from_any_yaw(a, b)
 
 
-def shape_of(background: Points, clouds: Sequence[Points]) -> RoomShape | None:
+def shape_of(background: Points, clouds: Iterable[Points]) -> RoomShape | None:
     """What is compared of a scan; None where it shows too little of a room, or is too wide to be one."""
     if len(background) < LEAST_BACKGROUND:
         return None
@@ -57,6 +63,6 @@ def rooms_of(scene: LivingScene, scan: Scan) -> Rooms:
     return Rooms(
         scene=apply_pose(last.frame.T_scene_scan, last.background),
         scan=scan.background,
-        objects=[apply_pose(place_of(o.observations[-1]), accumulated_points(o)) for o in scene.objects],
-        instances=[i.points for i in scan.instances],
+        objects=scene.objects,
+        instances=scan.instances,
     )

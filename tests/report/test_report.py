@@ -138,6 +138,10 @@ def test_how_a_scan_lies_in_a_frame_of_its_own_is_told_and_where_nothing_tells()
     told = [frame_text(scene, s) for s in scene.scans]
     assert told == [None, None, "friday: lies in a frame of its own, turned by 67° against monday"]
     assert "turned by 67° against monday." in report_html(scene, CONFIG)
+    tipped = np.eye(4)
+    tipped[:3, :3] = Rotation.from_euler("x", 90, degrees=True).as_matrix()
+    free = dataclasses.replace(in_frames(Frame(T_scene_scan=tipped)), upright=False)
+    assert "turned by 90°" in (frame_text(free, free.scans[-1]) or "")
     lost = in_frames(Frame(unknown=True))
     text = frame_text(lost, lost.scans[-1])
     assert text is not None and "nothing tells how" in text and text in report_html(lost, CONFIG)

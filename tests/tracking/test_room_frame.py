@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from factories import living_scene, turn_z
+from factories import living_scene, scene_object, turn_z
 from furnished_room import BOXES, box, empty_room
 
 from more2_jax.geometry.poses import apply_pose
@@ -12,7 +12,7 @@ from more2_jax.geometry.room_alignment import RoomFit
 from more2_jax.tracking.pose_voting import Votes
 from more2_jax.tracking.room_frame import ALONE, OFF_M, borne_out, frame_by_rooms, most_likely
 from more2_jax.tracking.rooms import Rooms, rooms_of
-from more2_jax.types import Frame, Scan
+from more2_jax.types import Frame, Instance, Scan
 
 SIDES_M = (5.0, 3.6)
 AWAY = turn_z(np.deg2rad(67.0), np.zeros(3), np.array([5.0, -3.0, 0.4]))  # T_scan_scene
@@ -41,7 +41,15 @@ def told(stayed: int, motion="upright", backgrounds=None, away=AWAY):
     ways = [np.linalg.inv(away) @ (np.eye(4) if k < stayed else moved) for k in range(3)]
     given = LIFTED if motion == "upright" else np.eye(4)
     centers = np.stack([o.mean(axis=0) for o in after])
-    known = Rooms(scene=rooms[0], scan=rooms[1], objects=before, instances=after)
+    known = Rooms(
+        scene=rooms[0],
+        scan=rooms[1],
+        objects=[
+            dataclasses.replace(scene_object(k, {0: np.eye(4)}), points=o, point_scan=np.zeros(len(o), int))
+            for k, o in enumerate(before)
+        ],
+        instances=[Instance(id=k, points=o) for k, o in enumerate(after)],
+    )
     return frame_by_rooms(known, votes(ways, centers), motion, given)
 
 
@@ -56,7 +64,7 @@ def test_one_object_that_stayed_tells_which_way_the_room_lies(motion):
     assert frame.sigma_m == OFF_M
 
 
-def test_nothing_is_said_where_no_object_stayed_or_rooms_are_not_seen_or_lie_as_given():
+def test_no_frame_is_told_where_no_object_stayed_or_rooms_are_not_seen_or_lie_as_given():
     lost = told(0)
     assert lost is not None and lost.unknown and lost.T_scene_scan is LIFTED
     assert told(3, backgrounds=(EMPTY, EMPTY)) is None
