@@ -33,7 +33,7 @@ from train.rooms.fused_scan import ScanSettings
 from train.rooms.mask_flaws import MASKS, Masks
 from train.rooms.real_files import write_real_scene
 from train.rooms.real_visits import RealConfig, RealScene, real_scene
-from train.rooms.regimes import REGIMES, Regime, check_scans, furniture, scene_config
+from train.rooms.regimes import REGIMES, Regime, check_scans, furniture, lived_in, scene_config
 from train.rooms.scene_files import write_scene
 from train.rooms.visits import FlyingScene, flying_scene
 from train.run.program import run
@@ -70,6 +70,8 @@ class Settings:
     """Who is to be named, for LICENSES.md."""
     masks: str | None = None
     """Of regime real: perfect (as without), cut, dirty, split, merged or mix."""
+    lived_in: bool = False
+    """Of regime real: 14 to 24 objects a room, sets that are alike, small things on furniture."""
     room_m: tuple[float, float] | None = None
     """Floor, x by y; 7 by 6 without, in regime real as the furniture needs."""
     cache: Path | None = None
@@ -81,7 +83,7 @@ class Settings:
 def main(settings: Annotated[Settings, tyro.conf.arg(name="")]) -> None:
     """Writes scenes with ground truth, index.json, LICENSES.md and report.json (models left out, and why)."""
     s = settings
-    regime, masks = _regime(s.regime), _masks(s.regime, s.masks)
+    regime, masks, crowded = _regime(s.regime), _masks(s.regime, s.masks), _lived_in(s)
     room_m = s.room_m if regime == "real" or s.room_m else ROOM_M
     check_scans(regime, s.scans)
     if s.scenes < 1 or s.seed < 0 or min(s.room_m or ROOM_M) <= 0:
@@ -100,6 +102,7 @@ def main(settings: Annotated[Settings, tyro.conf.arg(name="")]) -> None:
         seed=s.seed,
         room_m=room_m,
         masks=masks,
+        lived_in=crowded,
     )
     claim(job)
     with processes(job, s.workers) as pool:
@@ -132,6 +135,13 @@ def _masks(regime: str, name: str | None) -> Masks:
     return "perfect"
 
 
+def _lived_in(s: Settings) -> bool:
+    """Raises ValueError if such rooms are not to be had."""
+    if s.lived_in and (s.regime != "real" or s.free):
+        raise ValueError(f"lived in, regime {s.regime}, free {s.free}; needed regime real, upright")
+    return s.lived_in
+
+
 @dataclass(frozen=True, kw_only=True)
 class Job:
     """Everything that scenes depend on, but their number."""
@@ -145,6 +155,7 @@ class Job:
     seed: int
     room_m: tuple[float, float] | None
     masks: Masks = "perfect"
+    lived_in: bool = False
 
     @property
     def facts(self) -> dict[str, Any]:
@@ -159,6 +170,7 @@ class Job:
             "room_m": self.room_m and list(self.room_m),
             "models": models.hexdigest(),
             **({"masks": self.masks} if self.regime == "real" else {}),
+            **({"lived_in": True} if self.lived_in else {}),
         }
 
 
@@ -244,9 +256,14 @@ def _furnished(
 ) -> FlyingScene | RealScene:
     """A scene of the job's regime. ValueError if the furniture that is drawn does not fit."""
     if job.regime == "real":
-        chosen = furniture(job.regime, models, rng)
-        scanned = ScanSettings(masks=job.masks)
-        config = RealConfig(scans=job.scans, free=job.free, room_m=job.room_m, scanned=scanned)
+        chosen = lived_in(models, rng) if job.lived_in else furniture(job.regime, models, rng)
+        config = RealConfig(
+            scans=job.scans,
+            free=job.free,
+            room_m=job.room_m,
+            things_on_furniture=job.lived_in,
+            scanned=ScanSettings(masks=job.masks),
+        )
         return real_scene(chosen, config, rng, name)
     config = scene_config(job.regime, job.scans, rng, free=job.free)
     chosen = furniture(job.regime, models, rng)

@@ -21,6 +21,7 @@ from train.rooms.mask_flaws import FEWEST
 from train.rooms.mask_truth import Shown, shown_by
 from train.rooms.ray_scanner import PlacedMesh, Pose, footprint_radius
 from train.rooms.surroundings import Shape, loose_clutter, shell
+from train.rooms.things_on_furniture import Arranged, furnish_and_lay, is_small
 from train.rooms.visits import FlyingConfig, Furnished, TrueObject
 from train.rooms.whole_room import WholeRoom, in_sight, seen_of, whole_room
 
@@ -31,6 +32,7 @@ FLOOR_A_CIRCLE = (
 FLOOR_FREE = (2.6, 3.6)  # circles are kept apart, not boxes
 SMALLEST_ROOM_M = 3.2
 SKIPPING = 0.25  # of the scans skip a part of the room
+NOWHERE = Arranged(poses={}, borne_by={})  # before the first visit
 TALL_M = 1.0  # nobody holds a camera over what is higher
 
 
@@ -41,6 +43,7 @@ class RealConfig:
     scans: int = 2
     free: bool = False  # any rest orientation instead of upright
     room_m: tuple[float, float] | None = None  # floor, x by y; None: as the furniture needs
+    things_on_furniture: bool = False  # what is small stands on what is not
     scanned: ScanSettings = field(default_factory=ScanSettings)
 
 
@@ -62,12 +65,17 @@ class RealScene:
 class Visit:
     """One visit: where everything stood, and its scan."""
 
-    poses: dict[str, Pose]
+    arranged: Arranged
     scan: FusedScan
     shown: dict[str, Shown]
     seen: dict[str, np.ndarray]
     looked_at: dict[str, float]
     path: np.ndarray
+
+    @property
+    def poses(self) -> dict[str, Pose]:
+        """Where everything stood."""
+        return self.arranged.poses
 
 
 def real_scene(
@@ -78,7 +86,8 @@ def real_scene(
     Raises ValueError if there is no room for the furniture, or nowhere to stand.
     """
     furnished = Furnished.of(models, _roles(len(models), config, rng), rng)
-    radii = [footprint_radius(v) for v in furnished.vertices.values()]
+    on_floor = [v for v in furnished.vertices.values() if not (config.things_on_furniture and is_small(v))]
+    radii = [footprint_radius(v) for v in on_floor]
     room_m = config.room_m or _room_for(radii, FLOOR_FREE if config.free else FLOOR_A_CIRCLE, rng)
     kind: Frames = "own" if rng.random() < 0.5 else "aligned"
     frames = scan_frames(kind, config.scans, rng)
@@ -92,7 +101,7 @@ def real_scene(
     visits: list[Visit] = []
     last: dict[str, Pose] = {}  # where each object stood when it was there last
     for index in range(config.scans):
-        visits.append(place.visit(index, visits[-1].poses if visits else {}, last, frames[index], rng))
+        visits.append(place.visit(index, visits[-1].arranged if visits else NOWHERE, last, frames[index], rng))
         last |= visits[-1].poses
     return RealScene(
         name=name,
@@ -142,7 +151,7 @@ class Place:
     def visit(
         self,
         index: int,
-        before: Mapping[str, Pose],
+        before: Arranged,
         last: Mapping[str, Pose],
         T_scan_room: Pose,
         rng: np.random.Generator,
@@ -150,10 +159,8 @@ class Place:
         """Arranges the room and scans it."""
         present = {n: v for n, v in self.room.vertices.items() if index in self.room.present[n]}
         static = [n for n in present if self.room.roles[n] == "static"]
-        if self.config.free:
-            poses = arrange(present, before, static, self.room_m, rng, free=True)
-        else:
-            poses = furnish(present, before, static, self.room_m, rng)
+        arranged = self._arranged(present, before, static, rng)
+        poses = arranged.poses
         whole = self._whole(present, poses, rng)
         sensor = self.config.scanned.sensor
         path = self._path(present, poses, rng)
@@ -164,13 +171,30 @@ class Place:
         where = {n: _placed(self.room.samples[n], p) for n, p in poses.items()}
         expected = {n: _placed(self.room.samples[n], p) for n, p in {**poses, **last}.items()}
         return Visit(
-            poses=poses,
+            arranged=arranged,
             scan=scan,
             shown={names[k]: s for k, s in shown.items()},
             seen={n: seen_of(where[n], k, whole.owner, frames, sensor) for k, n in enumerate(names)},
             looked_at={n: float(in_sight(p, frames, sensor).mean()) for n, p in expected.items()},
             path=path,
         )
+
+    def _arranged(
+        self,
+        present: Mapping[str, np.ndarray],
+        before: Arranged,
+        static: Sequence[str],
+        rng: np.random.Generator,
+    ) -> Arranged:
+        """Where everything present stands now."""
+        if self.config.things_on_furniture:
+            meshes = {n: (v, self.room.models[n].faces) for n, v in present.items()}
+            return furnish_and_lay(meshes, before, static, self.room_m, rng)
+        if self.config.free:
+            poses = arrange(present, before.poses, static, self.room_m, rng, free=True)
+        else:
+            poses = furnish(present, before.poses, static, self.room_m, rng)
+        return Arranged(poses=poses, borne_by={})
 
     def _whole(
         self, present: Mapping[str, np.ndarray], poses: Mapping[str, Pose], rng: np.random.Generator
@@ -193,6 +217,8 @@ class Place:
         blind = blind_part(targets, self.room_m, rng) if rng.random() < SKIPPING else None
         taken: list[Circle] = []
         for n, v in present.items():
+            if self.config.things_on_furniture and is_small(v):
+                continue
             x, y, r = circle(v, poses[n], self.config.free)
             taken.append((x, y, r + 0.1 if standing[n][:, 2].max() > TALL_M else 0.7 * r))
         path = walk(targets, taken, self.room_m, self.config.scanned.walk, blind, rng)
@@ -206,7 +232,9 @@ def _placed(points: np.ndarray, pose: Pose) -> np.ndarray:
 def _object(name: str, room: Furnished, visits: Sequence[Visit]) -> TrueObject:
     """The truth about one object; its poses are in the frames of the scans, also of those that do not show it."""
     there = {k: v for k, v in enumerate(visits) if name in v.poses}
-    model = room.models[name]
+    model, role = room.models[name], room.roles[name]
+    if role == "static" and any((v.poses[name] != visits[0].poses[name]).any() for v in there.values()):
+        role = "moved"  # with what bears it
     return TrueObject(
         name=name,
         model=model.name,
@@ -215,7 +243,7 @@ def _object(name: str, room: Furnished, visits: Sequence[Visit]) -> TrueObject:
         faces=model.faces,
         instance={k: v.shown[name].instance for k, v in there.items() if name in v.shown},
         T_scan_model={k: np.round(v.scan.T_scan_room @ v.poses[name], 9) for k, v in there.items()},
-        role=room.roles[name],
+        role=role,
         seen={k: v.seen[name] for k, v in there.items()},
         license=model.license,
         source=model.source,

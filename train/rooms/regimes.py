@@ -9,6 +9,7 @@ from typing import Literal, get_args
 import numpy as np
 
 from train.furniture.source_mesh import SourceMesh, standing
+from train.rooms.things_on_furniture import is_small
 from train.rooms.visits import FlyingConfig
 
 Flying = Literal["paper", "sparse", "identical", "changes"]  # scanned by standing cameras (`visits`)
@@ -17,6 +18,9 @@ FLYING: tuple[Flying, ...] = get_args(Flying)
 REGIMES: tuple[Regime, ...] = (*FLYING, "real")
 OBJECTS = (4, 8)  # in a scene, least and most (paper §4)
 REAL_OBJECTS = (5, 8)
+LIVED_IN = (14, 24)  # in a room that is lived in
+SMALL_SHARE = 0.35  # of these, what may stand on furniture
+SETS = ((2, 4), (2, 3))  # copies in each of the sets that are alike: chairs about a table
 CHANGES_OBJECTS = (6, 8)  # so that every role is played and two objects move
 COPIES = (2, 4)  # of the same model in a scene of `identical`
 TWIN_SCALE = (0.04, 0.08)  # by how much a near-twin is larger or smaller along each axis
@@ -62,6 +66,23 @@ def furniture(regime: Regime, models: Sequence[SourceMesh], rng: np.random.Gener
     taken = {m.name for m in group}
     others = by_category([m for m in models if m.name not in taken])
     return [*group, *balanced(others, count - len(group), rng)]
+
+
+def lived_in(models: Sequence[SourceMesh], rng: np.random.Generator) -> list[SourceMesh]:
+    """The models of a room that is lived in: many, two sets of which are alike, some small enough for tables.
+
+    Raises ValueError if they are fewer than a room needs.
+    """
+    count = int(rng.integers(LIVED_IN[0], LIVED_IN[1] + 1))
+    small = [m for m in models if is_small(m.vertices)]
+    large = [m for m in models if not is_small(m.vertices)]
+    things = balanced(by_category(small), min(round(SMALL_SHARE * count), len(small)), rng)
+    copies = [int(rng.integers(least, most + 1)) - 1 for least, most in SETS]
+    pieces = balanced(by_category(large), count - len(things) - sum(copies), rng)
+    narrow = sorted(range(len(pieces)), key=lambda k: float(np.ptp(pieces[k].vertices[:, :2], axis=0).prod()))
+    for k, more in zip(narrow, copies, strict=False):
+        pieces += [pieces[k]] * more
+    return [*pieces, *things]
 
 
 def by_category(models: Sequence[SourceMesh]) -> dict[str, list[SourceMesh]]:
