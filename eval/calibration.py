@@ -317,7 +317,7 @@ def most(one: Bool[np.ndarray, "n m"]) -> int:
 def assigned(odds: Float[np.ndarray, "n m"]) -> Int[np.ndarray, "q 2"]:
     """The likeliest assignment, wherever things moved."""
     listed = LogOdds.of(odds)
-    return assign(listed, np.zeros(len(listed.value)), 0.0)
+    return assign(listed)
 
 
 if __name__ == "__main__":

@@ -108,6 +108,8 @@ class EvidenceMatcher:
     # Weight in the proposal of |log F_s ratio|, beside the cosine of the F_inv.
     size_weight: float = 0.5
     motion_weight: float = 0.2  # Log odds that each meter moved costs. It decides among identical objects.
+    # Log odds that a pair gains that fits where it would be had nothing moved: identical objects rarely change places.
+    stayed_weight: float = 6.0
     # The evidence is calibrated on poses found without free space, which counts when they are refined.
     search: SurfaceSearch = SurfaceSearch(free_weight=0.0)
 
@@ -290,6 +292,7 @@ def preset(name: str, *, upright: bool | None = None) -> SceneConfig:
         return SceneConfig(
             preset="robust",
             upright=upright,
+            static_deg=3.0,  # what drift alone turns things by in hand-held scans
             accumulate_target=True,
             accumulate_misfit=0.5,
             repair_masks=True,

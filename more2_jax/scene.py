@@ -126,7 +126,7 @@ def who_is_who(
                 del known  # one comparison at a time is in memory
                 known = compare(mended)
         masks, old, new, found = known
-        return masks, old, new, with_left_over(found, [o for o, _ in old], new, config).without_seen()
+        return masks, old, new, with_left_over(found, config).without_seen()
 
 
 def add_scan(

@@ -16,7 +16,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 FARTHEST_M = 10.0  # what moved farther is no less likely for it
-LEAST_GAIN = 0.05  # share of its log odds that motion leaves a pair
+LEAST_GAIN = 0.05  # share of its log odds that its motion leaves a pair
 AS_GOOD = 1.0  # of log odds: an exchange that loses less is as good
 NEVER = -np.inf  # log odds of a pair that is no candidate
 
@@ -55,16 +55,16 @@ def listed_at(listed: Pairs, pairs: Chosen, instances: int) -> Int[np.ndarray, "
     return np.searchsorted(known, asked)
 
 
-def assign(odds: LogOdds, moved_m: Float[np.ndarray, " p"], weight: float) -> Chosen:
+def assign(odds: LogOdds, motion: Float[np.ndarray, " p"] | float = 0.0) -> Chosen:
     """The pairs of the likeliest assignment: none that is likelier two objects than one.
 
-    A meter moved (`moved_m`, of every listed pair) takes `weight` off the log odds of pairs that are possible: it
+    `motion` of every listed pair is added to the log odds of those that are possible: how likely things move so. It
     decides among identical copies.
     """
     possible = odds.value > 0
     value, pairs = odds.value[possible], odds.pairs[possible]
-    nearer = value - weight * np.minimum(moved_m[possible], FARTHEST_M)
-    return pairs[largest_total(pairs, np.maximum(nearer, LEAST_GAIN * value), odds.shape)]
+    likelier = value + np.broadcast_to(motion, odds.value.shape)[possible]
+    return pairs[largest_total(pairs, np.maximum(likelier, LEAST_GAIN * value), odds.shape)]
 
 
 def largest_total(

@@ -25,6 +25,9 @@ class Compared:
     likeness: Float[np.ndarray, "*pairs"]  # cosine of the F_inv
     top_m: Float[np.ndarray, "*pairs"]  # difference of the heights of their highest points
     color: Float[np.ndarray, "*pairs"]  # log likelihood ratio of their colors (`color.color_evidence`)
+    portable: Float[np.ndarray, "*pairs"] | float = (
+        0.0  # 0 to 1: small enough to be put on furniture, and off it
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,6 +53,8 @@ class Calibration:
 
 MOST_LIFT_M = 0.05  # what scans of things that stand on a floor differ in height by noise alone, and more
 HIGHEST_M = 0.05  # a mask that is cut at the top hides how high the object is
+# Share of what heights cost that is taken off for a small thing: cut masks make large ones look small, too.
+CARRIED = 0.5
 UNKNOWN = 0.5  # of `off_own`: a prior that lays a cloud so far off its own surface has no say
 
 
@@ -122,13 +127,14 @@ def features(evidence: PairEvidence, compared: Compared) -> dict[str, Float[np.n
     """What each weight of a `Calibration` is multiplied with, by its name."""
     apart = np.stack([evidence.apart_source, evidence.apart_target])
     off = np.stack([evidence.off_source, evidence.off_target])
+    height = 1.0 - CARRIED * np.asarray(compared.portable)
     return {
         "likeness": compared.likeness,
         "apart_less": apart.min(axis=0),
         "apart_more": apart.max(axis=0),
         "contradicted": evidence.contradicted,
-        "lift": np.minimum(evidence.lift_m / MOST_LIFT_M, 1.0),
-        "top": np.minimum(compared.top_m / HIGHEST_M, 1.0),
+        "lift": height * np.minimum(evidence.lift_m / MOST_LIFT_M, 1.0),
+        "top": height * np.minimum(compared.top_m / HIGHEST_M, 1.0),
         "off_less": off.min(axis=0),
         "off_more": off.max(axis=0),
     }

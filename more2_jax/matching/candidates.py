@@ -50,6 +50,8 @@ from more2_jax.registration.search import (
 from more2_jax.types import ObservedObject
 
 TOP = 0.99  # share of a cloud's points below its top
+# Longest edge, meters, of what people put on furniture and take off it: surely, and hardly.
+PORTABLE_M = 0.45, 0.7
 OBJECTS_AT_ONCE = 64  # padded and prepared at a time
 
 
@@ -64,6 +66,7 @@ class AlignedPairs:
     sides: tuple[Sequence[ObservedObject], Sequence[ObservedObject]]  # instances (m) and objects (n)
     # Prepared; what sensors saw only where a search asks. Of many objects only what a comparison needs.
     ready: tuple[AlignableObject, AlignableObject]
+    origins: tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "n 3"]]  # of their local frames
     search: SurfaceSearch  # that they were prepared for
     stayed: jaxlie.SE3  # (p,): "it did not move", an instance's local frame to the object's
     found: FoundPoses  # (p, k), local frames: instances onto objects
@@ -136,26 +139,49 @@ def align_candidates(
     check_asked(prior, (*old, *new), matcher, motion)
     T = np.eye(4) if T_scene_scan is None else T_scene_scan
     worth = proposed(old, new, matcher, T if place is None else place)
-    rows = worth.pairs[:, ::-1]
     few = max(len(old), len(new)) <= OBJECTS_AT_ONCE
     (instances, of_new), (objects, of_old) = (prepared(x, matcher.search, motion, few) for x in (new, old))
-    ready, ends = (instances, objects), (of_old[rows[:, 1]], of_new[rows[:, 0]])
-    stayed = local_poses(np.broadcast_to(T, (len(rows), 4, 4)), *ends)
-    found = search_poses(*ready, stayed, matcher.search, motion, rows)
-    found, off, own = told_by_prior(prior, ready, rows, found, matcher.search, motion)
+    return aligned_pairs(
+        prior,
+        (new, old),
+        (instances, objects),
+        (of_new, of_old),
+        worth,
+        (matcher.search, motion),
+        T,
+        (seen or seen_in(old, new)) if motion == "upright" else None,
+    )
+
+
+def aligned_pairs(
+    prior: Prior,
+    sides: tuple[Sequence[ObservedObject], Sequence[ObservedObject]],
+    ready: tuple[AlignableObject, AlignableObject],
+    origins: tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "n 3"]],
+    worth: Proposed,
+    how: tuple[SurfaceSearch, MotionModel],
+    T_scene_scan: Pose,
+    seen: Seen | None,
+) -> AlignedPairs:
+    """The proposed pairs of instances and objects (`sides`), which are `ready`, with their local frames' origins."""
+    rows, (search, motion) = worth.pairs[:, ::-1], how
+    ends = origins[1][rows[:, 1]], origins[0][rows[:, 0]]
+    stayed = local_poses(np.broadcast_to(T_scene_scan, (len(rows), 4, 4)), *ends)
+    found = search_poses(*ready, stayed, search, motion, rows)
+    found, off, own = told_by_prior(prior, ready, rows, found, search, motion)
     T_old_new = world_poses(found.poses, ends[0][:, None], ends[1][:, None])
-    seen = (seen or seen_in(old, new)) if motion == "upright" else None
-    samples = samples_of(instances, of_new), samples_of(objects, of_old)
+    samples = samples_of(ready[0], origins[0]), samples_of(ready[1], origins[1])
     return AlignedPairs(
         ready=ready,
-        search=matcher.search,
+        origins=origins,
+        search=search,
         stayed=stayed,
         found=found,
         T_old_new=T_old_new,
         off=off,
         off_own=own,
-        height_m=float(T[2, 3]),
-        **known_of(worth, (new, old), samples, T_old_new, seen),
+        height_m=float(T_scene_scan[2, 3]),
+        **known_of(worth, sides, samples, T_old_new, seen),
     )
 
 
@@ -289,4 +315,16 @@ def compared(old: Sequence[ObservedObject], new: Sequence[ObservedObject], worth
         likeness=worth.likeness,
         top_m=np.abs(top[k] - other[i]),
         color=color_evidence([o.color for o in old], [o.color for o in new], worth.pairs),
+        portable=portable(np.maximum(longest(old)[k], longest(new)[i])),
     )
+
+
+def longest(side: Sequence[ObservedObject]) -> Float[np.ndarray, " k"]:
+    """Longest edge of every cloud's box, meters."""
+    return np.array([np.ptp(o.points, axis=0).max() for o in side])
+
+
+def portable(longest_m: Float[np.ndarray, " p"]) -> Float[np.ndarray, " p"]:
+    """How likely things of this size are put on furniture and off it, 0 to 1: their height then says little."""
+    surely, hardly = PORTABLE_M
+    return np.clip((hardly - longest_m) / (hardly - surely), 0.0, 1.0)

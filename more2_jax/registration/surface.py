@@ -42,12 +42,16 @@ from more2_jax.registration.search import (
     scaled_pose,
     search_poses,
 )
+from more2_jax.registration.starting_poses import masked_mean
 from more2_jax.types import Registration
 
 PAIRS_A_CALL = 1  # refined in a call, on CPUs one after the other anyway: nothing is worked on to fill a call
 STILL = 1e-2  # a last step below this (radians, and shares of the radius) has settled
 # How much worse "it did not move" may fit and still be chosen; so much worse, another pose still competes.
 STAYED_RATIO, STAYED_OFFSET = 1.1, 0.01
+# A center that is shifted by less, a share of the radius, has not moved; a turn by less may be an error; what a turn in
+# place must fit better than no motion.
+IN_PLACE, NOT_TURNED_DEG, TURNED_RATIO, TURNED_OFFSET = 0.25, 15.0, 1.2, 0.01
 FINE = 0.25  # share of the truncation: the nearer one by which refined poses are told apart
 TURNED_DEG = 15.0  # competing poses differ by more
 
@@ -121,6 +125,8 @@ def refine_pair(
     chosen = finalists(costs, poses, settings)
     poses, misfits, costs = jax.tree.map(lambda x: x[chosen], (poses, misfits, costs))
     doubt = prior_cost(prior, poses, costs, (source, target), settings)
+    if settings.try_stayed:
+        costs += turned_in_place(poses, stayed, masked_mean(s.sampled.points, s.sampled.mask), costs)
     best = choose(costs, settings.try_stayed, doubt)
     T = polished(jax.tree.map(lambda x: x[best], poses), (source, target), misfits[best], settings, motion)
     if settings.try_stayed:  # what stayed is exactly where it was
@@ -214,6 +220,19 @@ def choose(costs: Float[Array, " k"], stayed_is_last: bool, doubt: Float[Array, 
     if stayed_is_last:
         costs = costs.at[-1].set((costs[-1] - STAYED_OFFSET) / STAYED_RATIO)
     return jnp.argmin(costs + doubt)
+
+
+def turned_in_place(
+    poses: jaxlie.SE3, stayed: jaxlie.SE3, center: Float[Array, " 3"], costs: Float[Array, " k"]
+) -> Float[Array, " k"]:
+    """What poses cost that leave a cloud's center where it was: things that are not moved are seldom turned.
+
+    What is round, or nearly the same turned around, would seem to turn at every scan.
+    """
+    shift = jnp.linalg.norm(jax.vmap(lambda T: T @ center)(poses) - stayed @ center, axis=-1)
+    turned = jnp.linalg.norm((poses.rotation() @ stayed.rotation().inverse()).log(), axis=-1)
+    in_place = (shift < IN_PLACE) & (turned > jnp.deg2rad(NOT_TURNED_DEG))
+    return jnp.where(in_place, (TURNED_RATIO - 1) * costs + TURNED_OFFSET, 0.0)
 
 
 def nearly_as_good(costs: Float[Array, " k"], best: Array) -> Bool[Array, " k"]:

@@ -95,12 +95,18 @@ class Comparison:
         return self.odds_of_others([old], [new]).get((0, 0), NEVER)
 
     def odds_of_others(
-        self, old: Iterable[ObservedObject], new: Iterable[ObservedObject]
+        self, old: Iterable[ObservedObject], new: Iterable[ObservedObject], *, halves: bool = False
     ) -> dict[tuple[int, int], float]:
-        """Log odds of clouds of both scans that were not compared, by rows of `old` and `new`."""
+        """Log odds of clouds of both scans that were not compared, by rows of `old` and `new`.
+
+        Those of halves are small without being what people carry about.
+        """
         matcher = dataclasses.replace(self.matcher, candidates=CANDIDATES)
         T = self.identified.frame.T_scene_scan
         sides, seen = (list(old), list(new)), self.aligned.seen
         aligned = align_candidates(self.prior, *sides, matcher, self.config.motion, T, seen)
+        if halves:
+            known = dataclasses.replace(aligned.compared, portable=np.zeros(len(aligned.rows)))
+            aligned = dataclasses.replace(aligned, compared=known)
         odds = odds_of(aligned, matcher.search, self.config.motion, self.height_m())
         return {(k, i): z for (k, i), z in zip(odds.pairs.tolist(), odds.value.tolist(), strict=True)}

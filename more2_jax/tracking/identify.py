@@ -6,14 +6,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from jaxtyping import Float
 
 from more2_jax.config import CodeMatcher, EvidenceMatcher, SceneConfig
-from more2_jax.geometry.poses import apply_pose
 from more2_jax.matching.assignment import Chosen, LogOdds, assign, interchangeable, unmatched
 from more2_jax.matching.calibration import probability
 from more2_jax.matching.candidates import AlignedPairs, odds_of
 from more2_jax.matching.code_assignment import match_instances
+from more2_jax.matching.places import motion_odds
 from more2_jax.network.embedding_batch import stack
 from more2_jax.network.prior import Prior
 from more2_jax.tracking.objects import SCENE_FRAME
@@ -92,13 +91,11 @@ def by_evidence(
 ) -> Identified:
     """The assignment that surfaces find likeliest, with probabilities, and the frame of the scan."""
     frame, weighed = common_frame(prior, old, new, matcher, config.motion, rooms)
-    pairs = assign(weighed.odds, moved_m(weighed.odds, old, new, frame), matcher.motion_weight)
+    pairs = assign(weighed.odds, motion_odds(weighed.aligned, frame.T_scene_scan, matcher))
     return as_told(weighed.odds, pairs, frame, weighed.aligned, config)
 
 
-def with_left_over(
-    identified: Identified, old: Sequence[ObservedObject], new: Sequence[ObservedObject], config: SceneConfig
-) -> Identified:
+def with_left_over(identified: Identified, config: SceneConfig) -> Identified:
     """In any orientation: the same with pairs of what was left over that are nearly as likely one object as not.
 
     To be asked when masks are mended: until then, what is left over shows which masks to mend.
@@ -110,7 +107,7 @@ def with_left_over(
     k, i = odds.pairs.T
     rows = np.isin(k, list(identified.gone)) & np.isin(i, list(identified.new))
     left = LogOdds(pairs=odds.pairs[rows], value=odds.value[rows] + LEFT_OVER, shape=odds.shape)
-    more = assign(left, moved_m(left, old, new, frame), config.matching.motion_weight)
+    more = assign(left, motion_odds(aligned, frame.T_scene_scan, config.matching)[rows])
     if not len(more):
         return identified
     found = np.array([(f.object, f.instance) for f in identified.found], int).reshape(-1, 2)
@@ -131,19 +128,6 @@ def as_told(
         for (k, i), p, c in zip(pairs, chance[odds.rows_of(pairs)], copies, strict=True)
     )
     return Identified(found=found, gone=gone, new=fresh, frame=frame, aligned=aligned)
-
-
-def moved_m(
-    odds: LogOdds, old: Sequence[ObservedObject], new: Sequence[ObservedObject], frame: Frame
-) -> Float[np.ndarray, " p"]:
-    """How far every listed pair moved, if it is one object."""
-    k, i = odds.pairs.T
-    return np.linalg.norm(centers(old)[k] - apply_pose(frame.T_scene_scan, centers(new))[i], axis=-1)
-
-
-def centers(objects: Sequence[ObservedObject]) -> Float[np.ndarray, "n 3"]:
-    """The mean points, each in its object's frame."""
-    return np.stack([o.points.mean(axis=0) for o in objects])
 
 
 def chances(

@@ -142,7 +142,9 @@ def divisions_of_instances(compared: Comparison, instances: Sequence[Instance]) 
     return chosen(
         halves_of(compared, cuts, [(i.points, i.normals) for i in instances]),
         wholes,
-        lambda parts, others: compared.odds_of_others([compared.old[k] for k in others], map(half, parts)),
+        lambda parts, others: compared.odds_of_others(
+            [compared.old[k] for k in others], map(half, parts), halves=True
+        ),
     )
 
 
@@ -176,7 +178,7 @@ def divisions_of_objects(compared: Comparison, objects: Sequence[SceneObject]) -
         lambda parts, others: {
             (i, part): z
             for (part, i), z in compared.odds_of_others(
-                map(half, parts), [compared.new[i] for i in others]
+                map(half, parts), [compared.new[i] for i in others], halves=True
             ).items()
         },
     )

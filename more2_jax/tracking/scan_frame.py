@@ -13,6 +13,7 @@ import numpy as np
 from more2_jax.config import EvidenceMatcher, MotionModel
 from more2_jax.geometry.poses import Points, Pose, apply_pose, vertical_shift
 from more2_jax.matching.candidates import align_candidates, odds_of
+from more2_jax.matching.places import with_neighbors
 from more2_jax.matching.proposals import is_building, signatures
 from more2_jax.network.prior import Prior
 from more2_jax.tracking.pose_voting import (
@@ -66,10 +67,10 @@ def common_frame(
     T = frame.T_scene_scan
     misfit, before = (room_misfit(x, rooms.scene, rooms.scan) for x in (T, lifted))
     if misfit > ROOM_WORSE * before:
-        return Frame(T_scene_scan=lifted), weighed
+        return Frame(T_scene_scan=lifted), beside_one_another(prior, weighed, matcher, motion, lifted)
     if building and shift_m(T, lifted, votes.center) > ELSEWHERE_M:
         weighed = sought_there(prior, weighed, matcher, motion, T)
-    return frame, weighed
+    return frame, beside_one_another(prior, weighed, matcher, motion, T)
 
 
 def shift_m(T: Pose, other: Pose, points: Points) -> float:
@@ -86,6 +87,15 @@ def sought_there(
     lift = vertical_shift(weighed.aligned.height_m)
     seen = weighed.aligned.seen
     aligned = align_candidates(prior, old, new, matcher, motion, lift, seen, place=T_scene_scan)
+    odds = odds_of(aligned, matcher.search, motion, weighed.height_m)
+    return Weighed(height_m=weighed.height_m, aligned=aligned, odds=odds)
+
+
+def beside_one_another(
+    prior: Prior, weighed: Weighed, matcher: EvidenceMatcher, motion: MotionModel, T_scene_scan: Pose
+) -> Weighed:
+    """The same with pairs that the frame lays beside each other, which nobody knew before."""
+    aligned = with_neighbors(prior, weighed.aligned, matcher, motion, T_scene_scan)
     odds = odds_of(aligned, matcher.search, motion, weighed.height_m)
     return Weighed(height_m=weighed.height_m, aligned=aligned, odds=odds)
 

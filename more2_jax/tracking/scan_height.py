@@ -50,7 +50,7 @@ class Weighed:
     @cached_property
     def assigned(self) -> Int[np.ndarray, "q 2"]:
         """The likeliest assignment, wherever things moved."""
-        return assign(self.odds, np.zeros(len(self.odds.value)), 0.0)
+        return assign(self.odds)
 
     @property
     def explained(self) -> float:

@@ -58,7 +58,8 @@ def box(rng, size, count=600):
 def assigned(matrix, moved_m=0.0, weight=0.0):
     """The assignment of a matrix of log odds, every pair moved by so many meters."""
     odds = LogOdds.of(np.asarray(matrix))
-    return assign(odds, np.broadcast_to(moved_m, odds.shape)[tuple(odds.pairs.T)], weight)
+    far = np.minimum(np.broadcast_to(moved_m, odds.shape)[tuple(odds.pairs.T)], FARTHEST_M)
+    return assign(odds, -weight * far)
 
 
 def test_only_what_is_likelier_one_than_two_is_matched():

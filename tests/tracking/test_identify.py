@@ -12,18 +12,10 @@ from more2_jax.matching.assignment import LogOdds
 from more2_jax.matching.candidates import AlignedPairs
 from more2_jax.tracking import identify
 from more2_jax.tracking.identify import LEFT_OVER, Found, Identified, with_left_over
-from more2_jax.types import ObservedObject
 
 FREE, UPRIGHT = preset("robust", upright=False), preset("robust", upright=True)
 
 
-def at_origin() -> ObservedObject:
-    cloud = object.__new__(ObservedObject)
-    object.__setattr__(cloud, "points", np.zeros((1, 3)))
-    return cloud
-
-
-CLOUDS = [at_origin()] * 3
 # Object 0 is instance 1. Objects 1 and 2 are left over, as are instances 0 and 2.
 KNOWN = Identified(
     found=(Found(object=0, instance=1, score=0.9),),
@@ -35,7 +27,8 @@ KNOWN = Identified(
 
 def told(monkeypatch: pytest.MonkeyPatch, matrix: list[list[float]], config=FREE, known=KNOWN) -> Identified:
     monkeypatch.setattr(identify, "odds_of", lambda *_: LogOdds.of(np.array(matrix, float)))
-    return with_left_over(known, CLOUDS, CLOUDS, config)
+    monkeypatch.setattr(identify, "motion_odds", lambda *_: np.zeros(9))
+    return with_left_over(known, config)
 
 
 def pairs(found: Identified) -> list[tuple[int, int]]:

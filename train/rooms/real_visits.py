@@ -101,7 +101,9 @@ def real_scene(
     visits: list[Visit] = []
     last: dict[str, Pose] = {}  # where each object stood when it was there last
     for index in range(config.scans):
-        visits.append(place.visit(index, visits[-1].arranged if visits else NOWHERE, last, frames[index], rng))
+        visits.append(
+            place.visit(index, visits[-1].arranged if visits else NOWHERE, last, frames[index], rng)
+        )
         last |= visits[-1].poses
     return RealScene(
         name=name,

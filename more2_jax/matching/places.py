@@ -1,0 +1,111 @@
+"""What the places of things say of who is who, once it is known how a scan lies: most things stay where they were.
+
+Beyond the paper (`EvidenceMatcher`).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.spatial import KDTree
+
+from more2_jax.config import EvidenceMatcher, MotionModel
+from more2_jax.geometry.poses import Points, Pose, apply_pose
+from more2_jax.matching.assignment import FARTHEST_M
+from more2_jax.matching.calibration import Compared
+from more2_jax.matching.candidates import AlignedPairs, aligned_pairs
+from more2_jax.matching.metric_evidence import MetricEvidence
+from more2_jax.matching.proposals import Proposed, signatures
+from more2_jax.network.prior import Prior
+
+# How far what did not move may seem to have moved, and its center where it also seems to have turned.
+STAYED_M, STAYED_DEG, STAYED_TURNED_M = 0.15, 10.0, 0.06
+OTHER_COLOR = -1.0  # log likelihood ratio: what has less is of another color
+BY_PAIR = ("rows", "T_old_new", "top_gap_m", "off", "off_own")  # arrays of `AlignedPairs`
+BESIDE_M = 0.6  # centers of an object and of what a damaged mask shows of it, where it was
+
+
+def motion_odds(
+    aligned: AlignedPairs, T_scene_scan: Pose, matcher: EvidenceMatcher
+) -> Float[np.ndarray, " p"]:
+    """Log odds of how every pair moved, if it is one object, the scan lying at `T_scene_scan`: few things go far."""
+    k, i = aligned.rows.T
+    old, new = centers(aligned, T_scene_scan)
+    moved_m = np.minimum(np.linalg.norm(old[k] - new[i], axis=-1), FARTHEST_M)
+    return matcher.stayed_weight * stayed(aligned, T_scene_scan) - matcher.motion_weight * moved_m
+
+
+def stayed(aligned: AlignedPairs, T_scene_scan: Pose) -> Bool[np.ndarray, " p"]:
+    """Which pairs fit, by any of their poses, where the instance would be had nothing moved.
+
+    What is round may seem turned. What has another color has changed places with one that looks alike.
+    """
+    i = aligned.rows[:, 1]
+    own = np.stack([o.points.mean(axis=0) for o in aligned.sides[0]])[i]
+    R, t = aligned.T_old_new[..., :3, :3], aligned.T_old_new[..., :3, 3]
+    there = np.einsum("pkij,pj->pki", R, own) + t
+    apart_m = np.linalg.norm(there - apply_pose(T_scene_scan, own)[:, None], axis=-1)
+    cosine = (np.einsum("pkij,ij->pk", R, T_scene_scan[:3, :3]) - 1) / 2
+    as_turned = cosine > np.cos(np.deg2rad(STAYED_DEG))
+    here = ((apart_m < STAYED_M) & as_turned | (apart_m < STAYED_TURNED_M)).any(axis=1)
+    return here & (aligned.compared.color > OTHER_COLOR)
+
+
+def centers(aligned: AlignedPairs, T_scene_scan: Pose) -> tuple[Points, Points]:
+    """Mean points of objects and of instances, in the scene's frame."""
+    new, old = (np.stack([o.points.mean(axis=0) for o in side]) for side in aligned.sides)
+    return old, apply_pose(T_scene_scan, new)
+
+
+def with_neighbors(
+    prior: Prior, aligned: AlignedPairs, matcher: EvidenceMatcher, motion: MotionModel, T_scene_scan: Pose
+) -> AlignedPairs:
+    """The same with the pairs that lie beside each other, the scan lying at `T_scene_scan`.
+
+    Half of an object looks unlike the whole, so codes and sizes do not propose them where there is much else.
+    """
+    old, new = centers(aligned, T_scene_scan)
+    beside = KDTree(old).sparse_distance_matrix(KDTree(new), BESIDE_M, output_type="coo_matrix")
+    listed = set(map(tuple, aligned.rows.tolist()))
+    pairs = sorted({(int(k), int(i)) for k, i in zip(beside.row, beside.col, strict=True)} - listed)
+    if not pairs:
+        return aligned
+    a, b = (signatures(side).inv for side in aligned.sides[::-1])
+    k, i = np.array(pairs).T
+    worth = Proposed(
+        pairs=np.array(pairs), likeness=(a[k] * b[i]).sum(axis=1), rank=np.full((len(pairs), 2), np.inf)
+    )
+    T = np.eye(4)
+    T[2, 3] = aligned.height_m
+    how = matcher.search, motion
+    more = aligned_pairs(prior, aligned.sides, aligned.ready, aligned.origins, worth, how, T, aligned.seen)
+    return together(aligned, more)
+
+
+def together(a: AlignedPairs, b: AlignedPairs) -> AlignedPairs:
+    """The pairs of both, of the same objects and instances; none may be in both."""
+    order = np.lexsort(np.concatenate([a.rows, b.rows]).T[::-1])
+
+    def both(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        return np.concatenate([np.asarray(x), np.asarray(y)])[order]
+
+    def merged(x: object, y: object) -> dict[str, np.ndarray]:
+        return {
+            f.name: both(getattr(x, f.name), getattr(y, f.name))
+            for f in dataclasses.fields(x)  # pyright: ignore[reportArgumentType]
+        }
+
+    return dataclasses.replace(
+        a,
+        **{
+            name: both(getattr(a, name), getattr(b, name))
+            for name in ("rows", "T_old_new", "top_gap_m", "off", "off_own")
+        },
+        stayed=jax.tree.map(both, a.stayed, b.stayed),
+        found=jax.tree.map(both, a.found, b.found),
+        compared=Compared(**merged(a.compared, b.compared)),
+        metric=MetricEvidence(**merged(a.metric, b.metric)),
+    )
