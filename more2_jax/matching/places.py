@@ -100,10 +100,7 @@ def together(a: AlignedPairs, b: AlignedPairs) -> AlignedPairs:
 
     return dataclasses.replace(
         a,
-        **{
-            name: both(getattr(a, name), getattr(b, name))
-            for name in ("rows", "T_old_new", "top_gap_m", "off", "off_own")
-        },
+        **{name: both(getattr(a, name), getattr(b, name)) for name in BY_PAIR},
         stayed=jax.tree.map(both, a.stayed, b.stayed),
         found=jax.tree.map(both, a.found, b.found),
         compared=Compared(**merged(a.compared, b.compared)),
