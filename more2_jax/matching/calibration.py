@@ -25,9 +25,8 @@ class Compared:
     likeness: Float[np.ndarray, "*pairs"]  # cosine of the F_inv
     top_m: Float[np.ndarray, "*pairs"]  # difference of the heights of their highest points
     color: Float[np.ndarray, "*pairs"]  # log likelihood ratio of their colors (`color.color_evidence`)
-    portable: Float[np.ndarray, "*pairs"] | float = (
-        0.0  # 0 to 1: small enough to be put on furniture, and off it
-    )
+    # 0 to 1: small enough to be put on furniture, and off it.
+    portable: Float[np.ndarray, "*pairs"] | float = 0.0
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -123,10 +123,9 @@ def test_doubts_are_told():
 
 def in_frames(*frames: Frame):
     """The scene whose last scans lie so."""
-    scans = [
-        dataclasses.replace(s, frame=f) for s, f in zip(SCENE.scans[-len(frames) :], frames, strict=True)
-    ]
-    return dataclasses.replace(SCENE, scans=(*SCENE.scans[: -len(frames)], *scans))
+    kept, last = SCENE.scans[: -len(frames)], SCENE.scans[-len(frames) :]
+    scans = (dataclasses.replace(s, frame=f) for s, f in zip(last, frames, strict=True))
+    return dataclasses.replace(SCENE, scans=(*kept, *scans))
 
 
 def test_how_a_scan_lies_in_a_frame_of_its_own_is_told_and_where_nothing_tells():
@@ -138,12 +137,10 @@ def test_how_a_scan_lies_in_a_frame_of_its_own_is_told_and_where_nothing_tells()
     told = [frame_text(scene, s) for s in scene.scans]
     assert told == [None, None, "friday: lies in a frame of its own, turned by 67° against monday"]
     assert "turned by 67° against monday." in report_html(scene, CONFIG)
-    tipped = np.eye(4)
-    tipped[:3, :3] = Rotation.from_euler("x", 90, degrees=True).as_matrix()
+    tipped = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])  # about x
     free = dataclasses.replace(in_frames(Frame(T_scene_scan=tipped)), upright=False)
     assert "turned by 90°" in (frame_text(free, free.scans[-1]) or "")
-    lost = in_frames(Frame(unknown=True))
-    text = frame_text(lost, lost.scans[-1])
+    text = frame_text(lost := in_frames(Frame(unknown=True)), lost.scans[-1])
     assert text is not None and "nothing tells how" in text and text in report_html(lost, CONFIG)
     both = in_frames(Frame(T_scene_scan=turned), Frame(T_scene_scan=turned))
     assert frame_text(dataclasses.replace(both, scans=both.scans[1:]), both.scans[-1]) is None  # one frame
