@@ -17,6 +17,7 @@ from more2_jax.matching.color import color_of
 from more2_jax.meshing.engine import meshes_of_objects
 from more2_jax.network.embedding_batch import embed
 from more2_jax.network.prior import Prior
+from more2_jax.network.remembered_rows import rows_remembered
 from more2_jax.network.shared_calls import side_by_side
 from more2_jax.progress import Watcher, staged
 from more2_jax.refinement.joint_of_objects import fit_objects
@@ -119,7 +120,7 @@ def who_is_who(
         return divide_merged(masks, compared, next_number(masks.objects, scene.scans))
 
     mends = join_parts, divided, lambda m, compared: divided(m, compared) if m.divided else None
-    with stage("match", len(instances)):
+    with stage("match", len(instances)), rows_remembered():
         known = compare(masks)
         for mend in mends if config.repair_masks else ():
             if mended := mended_by(mend, known):

@@ -20,6 +20,7 @@ from jaxtyping import Array, Float, Int
 from more2_jax.config import MotionModel, SurfaceSearch
 from more2_jax.geometry.transform import rescale
 from more2_jax.network.prior import Prior
+from more2_jax.network.remembered_rows import only_new
 from more2_jax.network.row_map import chunked, chunked_at
 from more2_jax.registration.pose_costs import field_cost, off_field, off_fields
 from more2_jax.registration.search import AlignableObject, FoundPoses, rows_taken, scaled_pose
@@ -65,11 +66,16 @@ def off_completed_surfaces(
 
     By a few points of each cloud; of the first `LEADING` by all, which order these. `rows`: of sources and targets.
     """
-    return chunked_at(
-        partial(_off_completed_surfaces, prior, search=search),
-        PAIRS_A_CALL,
+    one_call = partial(_off_completed_surfaces, prior, search=search)
+
+    def taken(at: Int[np.ndarray, " k"]) -> tuple[AlignableObject, AlignableObject, FoundPoses]:
+        return *rows_taken(sides, rows[at]), jax.tree.map(lambda x: x[at], found)
+
+    return only_new(
+        one_call,
         len(rows),
-        lambda at: (*rows_taken(sides, rows[at]), jax.tree.map(lambda x: x[at], found)),
+        taken,
+        lambda at: chunked_at(one_call, PAIRS_A_CALL, len(at), lambda some: taken(at[some])),
     )
 
 

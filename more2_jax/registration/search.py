@@ -21,7 +21,8 @@ from more2_jax.geometry.full_precision import full_precision
 from more2_jax.geometry.point_to_plane import Surface, align_by, coarsened, surrounded, whole_surface
 from more2_jax.geometry.points import cloud_radius
 from more2_jax.geometry.transform import rescale
-from more2_jax.network.row_map import chunked, chunked_at
+from more2_jax.network.remembered_rows import only_new
+from more2_jax.network.row_map import chunked, chunked_at, traced
 from more2_jax.registration.pose_costs import (
     free_space_cost,
     height_cost,
@@ -70,7 +71,17 @@ class FoundPoses:
 def alignable(batch: LocalBatch, search: SurfaceSearch) -> AlignableObject:
     """Every object of a batch with its normals, what lies around it, and its coarse surface."""
     local = LocalBatch(cloud=batch.cloud, code=batch.code, sight=batch.sight, around=batch.around)
-    return chunked(partial(_alignable, search=search), OBJECTS_A_CALL, local)
+    one_call = partial(_alignable, search=search)
+    if traced(local):
+        return one_call(local)
+    host = jax.tree.map(np.asarray, local)
+
+    def taken(at: Int[np.ndarray, " k"]) -> LocalBatch:
+        return jax.tree.map(lambda x: x[at], host)
+
+    return only_new(
+        one_call, len(host.cloud.mask), taken, lambda at: chunked(one_call, OBJECTS_A_CALL, taken(at))
+    )
 
 
 @partial(jax.jit, static_argnames="search")
@@ -112,11 +123,15 @@ def search_poses(
     source, target = searched(source), searched(target)
     if rows is None:
         return chunked(one_call, PAIRS_A_CALL, (source, target, stayed))
-    return chunked_at(
+
+    def taken(at: Int[np.ndarray, " k"]) -> tuple[AlignableObject, AlignableObject, jaxlie.SE3]:
+        return *rows_taken((source, target), rows[at]), jax.tree.map(lambda x: x[at], stayed)
+
+    return only_new(
         one_call,
-        PAIRS_A_CALL,
         len(rows),
-        lambda at: (*rows_taken((source, target), rows[at]), jax.tree.map(lambda x: x[at], stayed)),
+        taken,
+        lambda at: chunked_at(one_call, PAIRS_A_CALL, len(at), lambda some: taken(at[some])),
     )
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -37,6 +37,7 @@ FLOORS_APART_M = (
     0.05  # floors at other heights than these are seen apart: the lift between them is then expected
 )
 OUT_OF_REACH_M = 0.1  # an alignment begun at another height finds its own from nearer than this
+BEGUN_APART_M = 0.05  # and two lifts nearer than this are settled from one alignment, begun at the first
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,11 +83,20 @@ def common_height(
     votes, weights = height_votes(old, new, matcher)
     floors = [floor_height(p) for p in (rooms.scene, rooms.scan)]
     between_m = 0.0 if floors[0] is None or floors[1] is None else floors[0] - floors[1]
-    lifts_m = {between_m} | ({best_vote(votes, weights)} if doubtful(votes, weights) else set())
+    lifts_m = [between_m, *([best_vote(votes, weights)] if doubtful(votes, weights) else [])]
     seen = seen_in(old, new, rooms.scene, rooms.scan)
-    aligned = align_candidates(prior, old, new, matcher, "upright", seen=seen)
+
+    def aligned_at(height_m: float) -> AlignedPairs:
+        return align_candidates(prior, old, new, matcher, "upright", vertical_shift(height_m), seen)
+
+    aligned = aligned_at(0.0)
     none = weighed_at(aligned, matcher, 0.0)
-    lifted = {m: lifted_by(m, prior, old, new, matcher, aligned) for m in lifts_m if abs(m) > LEAST_M}
+    begun, lifted = {0.0: aligned}, dict[float, Weighed]()
+    for m in (m for m in lifts_m if abs(m) > LEAST_M):
+        begins_m = begins_at(m, begun)
+        if begins_m not in begun:
+            begun[begins_m] = aligned_at(begins_m)
+        lifted[m] = settled_height(begun[begins_m], matcher, m)
     expected = none
     if abs(between_m) > FLOORS_APART_M and lifted[between_m].matched >= none.matched:
         expected = lifted[between_m]
@@ -94,19 +104,11 @@ def common_height(
     return max(others, key=lambda x: x.explained, default=expected)
 
 
-def lifted_by(
-    height_m: float,
-    prior: Prior,
-    old: Sequence[ObservedObject],
-    new: Sequence[ObservedObject],
-    matcher: EvidenceMatcher,
-    aligned: AlignedPairs,
-) -> Weighed:
-    """The pairs at a lift; aligned anew for one too large for an alignment to find from where it was."""
-    if abs(height_m) > OUT_OF_REACH_M:
-        lift = vertical_shift(height_m)
-        aligned = align_candidates(prior, old, new, matcher, "upright", lift, aligned.seen)
-    return settled_height(aligned, matcher, height_m)
+def begins_at(height_m: float, begun: Iterable[float]) -> float:
+    """At which height the alignment begins that is to find this one: one that has `begun`, if that is near enough."""
+    if abs(height_m) <= OUT_OF_REACH_M:
+        return 0.0
+    return next((m for m in begun if m and abs(height_m - m) < BEGUN_APART_M), height_m)
 
 
 def weighed_at(aligned: AlignedPairs, matcher: EvidenceMatcher, height_m: float) -> Weighed:
