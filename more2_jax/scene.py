@@ -29,7 +29,7 @@ from more2_jax.tracking.comparison import Comparison
 from more2_jax.tracking.identify import Found, Identified, chances, identify, with_left_over
 from more2_jax.tracking.joined_masks import join_parts
 from more2_jax.tracking.leveling import as_given, level_by_objects, level_of, leveled, shows_floor, tells_up
-from more2_jax.tracking.looked_at import not_looked_at
+from more2_jax.tracking.looked_at import not_looked_at, not_looked_at_before, with_not_seen
 from more2_jax.tracking.mask_borders import mend_borders
 from more2_jax.tracking.merged_masks import divide_merged
 from more2_jax.tracking.object_views import Views, few_sensors
@@ -183,10 +183,11 @@ def added(
     fresh = new_objects(next_number(objects, scene.scans), index, left, whole.instances, codes, frame)
     chance = chances(identified, objects, fresh, config)
     objects, frame = as_given([*mended.whole(objects), *fresh.values()], index, frame, T_level_scan)
+    before = not_looked_at_before(objects, list(fresh.values()), scene.scans, scene.upright)
     repairs = (*whole.repairs, *whole.masks(found, fresh), *mended.repairs)
     scene = forgotten(scene, {id_ for r in repairs for id_ in r.absorbed})
     repairs = (*repairs, *cleared.repairs(index, objects, repairs), *borders)
-    scans = (*scene.scans, record(index, scan, masks, skipped, frame, unseen, repairs))
+    scans = (*with_not_seen(scene.scans, before), record(index, scan, masks, skipped, frame, unseen, repairs))
     changes = (*scene.changes, changes_between(objects, index - 1, index, config, chance, not_seen_in(scans)))
     return dataclasses.replace(scene, scans=scans, objects=tuple(objects), changes=changes, timing_s=timing)
 

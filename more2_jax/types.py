@@ -347,6 +347,7 @@ class Changes:
     added: tuple[str, ...] = ()
     removed: tuple[str, ...] = ()
     not_seen: tuple[str, ...] = ()  # known before; the later scan did not look where they last stood
+    discovered: tuple[str, ...] = ()  # new; no scan before had looked where they stand
     probability: dict[str, float] = field(default_factory=dict)  # of what is said of an object, where known
 
 
@@ -375,7 +376,9 @@ class ScanRecord:
     source: str
     instances: tuple[int, ...]
     skipped: tuple[Skipped, ...] = ()
-    not_seen: tuple[str, ...] = ()  # ids of objects known then, and missing, whose place it did not look at
+    not_seen: tuple[
+        str, ...
+    ] = ()  # ids of objects, known before or found since, whose place it did not look at
     repairs: tuple[Repair, ...] = ()  # that it led to
     frame: Frame = field(default_factory=Frame, compare=False)
     background: Float[np.ndarray, "b 3"] = field(  # thinned, to look at; meters, in the scan's frame, float64

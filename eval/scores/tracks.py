@@ -30,6 +30,7 @@ class Track:
         default_factory=dict
     )  # by scan, its own points, where masks were mended; else those of its instance
     moved: dict[int, bool] = field(default_factory=dict)  # by scan, since the one before; where that is said
+    not_seen: frozenset[int] = frozenset()  # scans of which it is said that they did not look for it
 
 
 def tracks_of(scene: LivingScene) -> list[Track]:
@@ -43,6 +44,7 @@ def tracks_of(scene: LivingScene) -> list[Track]:
             score=min(*(seen.score for seen in o.observations), *came_or_went(scene, o.id), 1.0),
             seen={seen.scan: points_of(o, seen) for seen in o.observations},
             moved={c.to_scan: o.id in c.moved for c in scene.changes if o.id in c.moved + c.static},
+            not_seen=frozenset(s.index for s in scene.scans if o.id in s.not_seen),
         )
         for o in scene.objects
     ]
@@ -133,7 +135,7 @@ def changes_f1(scene: KnownScene, tracks: Sequence[Track]) -> float:
     """F1 of added and removed between scans that follow each other: instances that begin or end a presence.
 
     An object that is there and not seen has not come or gone, and a method cannot know: what is said of it at such a
-    scan counts neither way.
+    scan counts neither way. A method that says it did not look for something does not say that it came or went.
     """
     said, true, open_ = set[str](), set[str](), set[str]()
     for k in range(1, len(scene.scans)):
@@ -141,7 +143,7 @@ def changes_f1(scene: KnownScene, tracks: Sequence[Track]) -> float:
             said |= {
                 f"{name} {k} {t.instance[here]}"
                 for t in tracks
-                if here in t.instance and other not in t.instance
+                if here in t.instance and other not in t.instance and other not in t.not_seen
             }
             for o in (o for o in scene.objects if here in o.instance and other not in o.instance):
                 if other in o.T_scan_model:

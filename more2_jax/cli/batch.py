@@ -31,10 +31,11 @@ COLUMNS: dict[str, type] = {
     "added": int,
     "removed": int,
     "not_seen": int,
+    "discovered": int,
     "seconds": float,  # of all stages, as the scene keeps them
     "out": str,
 }
-COUNTED = ("moved", "added", "removed", "not_seen")  # of all changes between scans that follow each other
+COUNTED = ("moved", "added", "removed", "not_seen", "discovered")  # of all changes between following scans
 DAMAGE = (OSError, ValueError, KeyError, TypeError)
 
 

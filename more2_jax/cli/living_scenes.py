@@ -319,6 +319,7 @@ def tell(session: Session, scene: LivingScene) -> None:
             f"{c.from_scan} → {c.to_scan}: moved {list(c.moved)}, static {list(c.static)}, "
             f"added {list(c.added)}, removed {list(c.removed)}"
             + (f", not seen {list(c.not_seen)}" if c.not_seen else "")
+            + (f", discovered {list(c.discovered)}" if c.discovered else "")
         )
     seconds = ", ".join(f"{stage} {s:.1f}" for stage, s in scene.timing_s.items())
     session.say(f"{len(scene.objects)} objects over {len(scene.scans)} scans; seconds: {seconds}")

@@ -11,7 +11,14 @@ from more2_jax.progress import STAGES
 from more2_jax.report.wording import STATES, repair_text
 from more2_jax.types import LivingScene, ScanRecord
 
-WORDS = {"moved": "moved", "added": "added", "removed": "removed", "static": "stayed", "not_seen": "not seen"}
+WORDS = {
+    "moved": "moved",
+    "added": "added",
+    "removed": "removed",
+    "static": "stayed",
+    "not_seen": "not seen",
+    "discovered": "discovered",
+}
 
 
 def object_list(objects: Sequence[Mapping[str, Any]], verdicts: Sequence[Mapping[str, Any]]) -> str:
@@ -64,7 +71,7 @@ def changes_list(scene: LivingScene, data: Mapping[str, Any]) -> str:
         who = "".join(
             f"<li>{escape(o['name'])}: {escape(v['text'])}</li>"
             for o, v in zip(data["objects"], pair["verdicts"], strict=True)
-            if v["status"] in ("moved", "added", "removed", "not_seen")
+            if v["status"] in ("moved", "added", "removed", "not_seen", "discovered")
         )
         items.append(f"<li>{escape(pair['headline'])}{f'<ul>{who}</ul>' if who else ''}</li>")
     return f'<ol class="steps">{"".join(items)}</ol>'

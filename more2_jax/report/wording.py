@@ -19,8 +19,8 @@ LOW_SCORE = 0.3  # a match below it is told as unsure; same objects usually scor
 UNLIKELY = 0.6  # as is a change that is less probable than this
 LEAST_TURN_DEG = 2.0  # of a scan's frame against the first one's that is worth telling
 
-Status = Literal["moved", "static", "added", "removed", "not_seen", "present", "absent"]
-STATES: tuple[Status, ...] = ("moved", "added", "removed", "static", "not_seen")
+Status = Literal["moved", "static", "added", "removed", "not_seen", "discovered", "present", "absent"]
+STATES: tuple[Status, ...] = ("moved", "added", "removed", "static", "not_seen", "discovered")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -162,6 +162,7 @@ def phrase(v: Verdict) -> str:
         "added": "added",
         "removed": "removed",
         "not_seen": "not seen: the scan did not look where it stood",
+        "discovered": "discovered: no scan had looked here before",
         "present": "here",
         "absent": "not here",
     }
@@ -190,6 +191,7 @@ def headline(scene: LivingScene, verdicts: Sequence[Verdict], a: int, b: int) ->
         ("removed", "was removed", "were removed"),
         ("static", "stayed", "stayed"),
         ("not_seen", "was not seen", "were not seen"),
+        ("discovered", "was discovered", "were discovered"),
     ):
         if n := counts[status]:
             parts.append(f"{_objects(n) if first else n} {one if n == 1 else more}")

@@ -236,6 +236,7 @@ def _scene(folder: Path, content: dict[str, Any]) -> LivingScene:
                 to_scan=c["to"],
                 **{k: tuple(c[k]) for k in kinds},
                 not_seen=tuple(c.get("not_seen", ())),
+                discovered=tuple(c.get("discovered", ())),
                 probability=c.get("probability", {}),
             )
             for c in content["changes"]

@@ -54,7 +54,7 @@ def scene_to_json(scene: LivingScene) -> dict[str, Any]:
                 "removed": list(c.removed),
                 "probability": {k: float(p) for k, p in c.probability.items()},
             }
-            | _where_any(not_seen=list(c.not_seen))
+            | _where_any(not_seen=list(c.not_seen), discovered=list(c.discovered))
             for c in scene.changes
         ],
         "timing_s": {k: float(scene.timing_s.get(k, 0.0)) for k in (*STAGES, *scene.timing_s)},

@@ -1,4 +1,4 @@
-"""What became of every object between two scans: it moved, stayed, came, went, or was not looked at."""
+"""What became of every object between two scans: it moved, stayed, came, went, or was not looked for."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from more2_jax.types import Changes, LivingScene, Observation, ScanRecord, Scene
 OPTIMISM = 3.0
 SURE = 2.0  # standard errors that a motion must exceed
 
+KINDS = ("moved", "static", "added", "removed", "not_seen", "discovered")
 NotSeen = Mapping[
     int, Collection[str]
 ]  # of a scan, the ids of missing objects whose place it did not look at
@@ -34,7 +35,7 @@ def changes_between(
     `chance`: probabilities, by object, that what came or went did. Those of motion are worked out here. An object
     that scan `a` did not look for is compared with the scan that did.
     """
-    found: dict[str, list[str]] = {"moved": [], "static": [], "added": [], "removed": [], "not_seen": []}
+    found: dict[str, list[str]] = {kind: [] for kind in KINDS}
     probability: dict[str, float] = {}
     not_seen = not_seen or {}
     for o in objects:
@@ -45,6 +46,8 @@ def changes_between(
             probability[o.id] = max(moved, 1 - moved)
         elif before and o.id in not_seen.get(b, ()):
             found["not_seen"].append(o.id)
+        elif after and not looked_for(o, a, not_seen):
+            found["discovered"].append(o.id)
         elif before or after:
             found["removed" if before else "added"].append(o.id)
             if chance and o.id in chance:
@@ -66,11 +69,10 @@ def forgotten(scene: LivingScene, ids: Collection[str]) -> LivingScene:
     def less(names: tuple[str, ...]) -> tuple[str, ...]:
         return tuple(n for n in names if n not in ids)
 
-    kinds = ("moved", "static", "added", "removed", "not_seen")
     changes = tuple(
         dataclasses.replace(
             c,
-            **{k: less(getattr(c, k)) for k in kinds},
+            **{k: less(getattr(c, k)) for k in KINDS},
             probability={k: p for k, p in c.probability.items() if k not in ids},
         )
         for c in scene.changes
@@ -87,6 +89,11 @@ def last_known(o: SceneObject, scan: int, not_seen: NotSeen) -> Observation | No
     while scan > 0 and observation_in(o, scan) is None and o.id in not_seen.get(scan, ()):
         scan -= 1
     return observation_in(o, scan)
+
+
+def looked_for(o: SceneObject, scan: int, not_seen: NotSeen) -> bool:
+    """Whether this scan or one before it looked where an object stands that was found later."""
+    return any(o.id not in not_seen.get(k, ()) for k in range(scan + 1))
 
 
 def moved_probability(o: SceneObject, before: Observation, after: Observation, config: SceneConfig) -> float:

@@ -70,6 +70,7 @@ class Wholes:
     scale: Sequence[float]  # F_s of the other scan's clouds
     odds: Mapping[int, float]  # log odds of a cloud with its partner
     least: LeastGain  # of its divisions
+    both_known: bool = False  # whether both halves must be, wherever they touch
     # As `left`, though something was found to be each, hardly: log odds that are lost with it.
     doubtful: Mapping[int, float] = field(default_factory=dict)
 
@@ -111,9 +112,10 @@ class Wholes:
             return False
         if self.taken(whole, division.others) and division.gain <= self.least.taken:
             return False
-        if division.parts[0].narrow:
+        known = None not in division.others
+        if division.parts[0].narrow and (known or not self.both_known):
             return division.gain > self.least.narrow
-        return None not in division.others and division.gain > self.least.wide
+        return known and division.gain > self.least.wide
 
 
 def chosen(halves: Sequence[tuple[Part, Part]], wholes: Wholes, weigh: Weigh) -> list[Division]:

@@ -77,10 +77,11 @@ def share_near(tree: KDTree, points: Points) -> float:
 def divide_merged(whole: Regrouped, compared: Comparison, first_number: int) -> Regrouped | None:
     """Divides instances that hold two objects known apart, and objects, seen once, that two instances show apart.
 
-    None if there is nothing to divide.
+    None if there is nothing to divide. Once more after a division, in any orientation, both halves must be known.
     """
-    of_instances = divisions_of_instances(compared, whole.instances)
-    of_objects = divisions_of_objects(compared, whole.objects)
+    both_known = whole.divided and compared.config.motion == "free"
+    of_instances = divisions_of_instances(compared, whole.instances, both_known)
+    of_objects = divisions_of_objects(compared, whole.objects, both_known)
     if not of_instances and not of_objects:
         return None
     return with_instances_divided(with_objects_divided(whole, of_objects, first_number), of_instances)
@@ -112,10 +113,12 @@ def with_instances_divided(whole: Regrouped, divisions: Sequence[Division]) -> R
     return dataclasses.replace(whole, instances=instances, embeddings=embeddings, halves=tuple(halves))
 
 
-def divisions_of_instances(compared: Comparison, instances: Sequence[Instance]) -> list[Division]:
+def divisions_of_instances(
+    compared: Comparison, instances: Sequence[Instance], both_known: bool = False
+) -> list[Division]:
     """Which instances hold two objects that are known apart."""
     partner = {f.instance: f.object for f in compared.identified.found}
-    wholes = wholes_of(compared, partner, compared.old, side=1)
+    wholes = wholes_of(compared, partner, compared.old, 1, both_known)
     T_scan_scene = np.linalg.inv(compared.identified.frame.T_scene_scan)
     standing = Standing.of(wholes.may_be_taken, compared.old, T_scan_scene)
     cuts = {
@@ -148,10 +151,12 @@ def divisions_of_instances(compared: Comparison, instances: Sequence[Instance]) 
     )
 
 
-def divisions_of_objects(compared: Comparison, objects: Sequence[SceneObject]) -> list[Division]:
+def divisions_of_objects(
+    compared: Comparison, objects: Sequence[SceneObject], both_known: bool = False
+) -> list[Division]:
     """Which objects, seen once, are two that the new scan shows apart."""
     partner = {f.object: f.instance for f in compared.identified.found}
-    wholes = wholes_of(compared, partner, compared.new, side=0)
+    wholes = wholes_of(compared, partner, compared.new, 0, both_known)
     seen_once = [k for k, o in enumerate(objects) if len(o.observations) == 1]
     standing = Standing.of(wholes.may_be_taken, compared.new, compared.identified.frame.T_scene_scan)
     cuts = {
@@ -221,7 +226,11 @@ def halves_of(
 
 
 def wholes_of(
-    compared: Comparison, partner: Mapping[int, int], others: Sequence[ObservedObject], side: int
+    compared: Comparison,
+    partner: Mapping[int, int],
+    others: Sequence[ObservedObject],
+    side: int,
+    both_known: bool,
 ) -> Wholes:
     """How the clouds of one scan, objects (side 0) or instances (1), stand to `others`, those of the other."""
     odds = compared.odds_of_found(side)
@@ -232,6 +241,7 @@ def wholes_of(
         odds=odds,
         doubtful={k: odds[w] for w, k in partner.items() if odds[w] < compared.even_odds},
         least=LEAST_GAIN[compared.config.motion],
+        both_known=both_known,
     )
 
 

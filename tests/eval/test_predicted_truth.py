@@ -100,3 +100,18 @@ def test_what_is_not_seen_has_neither_come_nor_gone(absent):
     assert changes_f1(gone, true_tracks(gone)) == 1
     assert changes_f1(gone, true_tracks(gone)[1:]) == 0
     assert changes_f1(unseen, true_tracks(unseen)[1:]) == 1
+
+
+@pytest.mark.parametrize("absent", [0, 1])
+def test_who_says_that_a_scan_did_not_look_says_no_change(absent):
+    seen = {k: i for k, i in SCENE.objects[0].instance.items() if k != absent}
+    poses = {k: T for k, T in SCENE.objects[0].T_scan_model.items() if k != absent}
+    gone = with_object(SCENE, 0, instance=seen, T_scan_model=poses)
+    first, *others = true_tracks(gone)
+    silent = dataclasses.replace(first, not_seen=frozenset({absent}))
+    assert changes_f1(gone, [silent, *others]) == 0  # it had changed
+    first, *others = true_tracks(SCENE)
+    (kept,) = set(first.instance) - {absent}
+    part = dataclasses.replace(first, instance={kept: first.instance[kept]})
+    assert changes_f1(SCENE, [part, *others]) == 0  # it had not
+    assert changes_f1(SCENE, [dataclasses.replace(part, not_seen=frozenset({absent})), *others]) == 1

@@ -375,6 +375,17 @@ def test_what_was_not_seen_is_told_so_and_not_as_removed():
     assert "not seen" in told and "removed" not in told
 
 
+def test_what_was_found_where_no_scan_had_looked_is_told_so_and_not_as_added():
+    changes = [dataclasses.replace(c, added=(), discovered=c.added) for c in SCENE.changes]
+    new = {o: c.to_scan for c in changes for o in c.discovered}
+    scans = [
+        dataclasses.replace(s, not_seen=tuple(o for o, k in new.items() if s.index < k)) for s in SCENE.scans
+    ]
+    text = report_html(dataclasses.replace(SCENE, changes=tuple(changes), scans=tuple(scans)), CONFIG)
+    assert new and "discovered: no scan had looked here before" in text
+    assert "discovered" in text and "was added" not in text and "were added" not in text
+
+
 def test_mended_masks_are_listed():
     repairs = (
         Repair(object="object_001", instances=(3, 5, 6), share=0.92),

@@ -47,7 +47,8 @@ def test_poses_are_what_they_were(scene):
 def test_changes_are_what_they_were(scene):
     then = json.loads(str(TOLD["changes"]))
     now = json.loads(json.dumps([dataclasses.asdict(c) for c in scene.changes]))
-    assert all(c.pop("not_seen") == [] for c in now)  # which that version did not tell apart from removed
+    # Which that version did not tell apart from removed and added:
+    assert all(c.pop("not_seen") == c.pop("discovered") == [] for c in now)
     assert now == then
     assert (then[0]["moved"], then[0]["removed"]) == (["object_001"], ["object_002"])
 

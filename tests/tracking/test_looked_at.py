@@ -1,4 +1,4 @@
-"""Removed, or not seen: a scan that shows neither an object nor the floor under it did not look."""
+"""Removed or not seen, added or discovered: a scan that shows neither an object nor the floor under it did not look."""
 
 import dataclasses
 
@@ -9,7 +9,17 @@ from scipy.spatial import KDTree
 from more2_jax.config import preset
 from more2_jax.geometry.poses import apply_pose
 from more2_jax.tracking.changes import changes_between, last_known, not_seen_in
-from more2_jax.tracking.looked_at import LOOKED_AT, Columns, looked_at, looked_at_upright, not_looked_at
+from more2_jax.tracking.looked_at import (
+    CELL_M,
+    LOOKED_AT,
+    Columns,
+    column_side_m,
+    looked_at,
+    looked_at_upright,
+    not_looked_at,
+    not_looked_at_before,
+    with_not_seen,
+)
 from more2_jax.tracking.objects import new_object, seen_again
 from more2_jax.types import Embedding, Frame, Instance, Observation, Scan, ScanRecord
 
@@ -114,3 +124,81 @@ def test_an_object_not_looked_for_is_compared_with_the_scan_that_saw_it_last():
     assert nothing[0].removed == nothing[1].added == (o.id,)
     young = dataclasses.replace(o, observations=o.observations[1:], reference_scan=2)
     assert last_known(young, 1, seen) is None
+
+
+# --- what is new where no scan had looked ---------------------------------------------------------------------------
+
+THERE, ELSEWHERE = floor([0, 0], [4, 3]), floor([-4, 0], [1.4, 3])
+
+
+def records(*backgrounds, frame=None):
+    return tuple(
+        ScanRecord(index=k, name="", source="", instances=(), background=b, frame=frame or Frame())
+        for k, b in enumerate(backgrounds)
+    )
+
+
+def found_new(*backgrounds, upright=True, known=(), frame=None):
+    """What is said of a box that the last of several scans has alone, and of which earlier scans it is not seen."""
+    scans, last = records(*backgrounds, frame=frame), len(backgrounds)
+    new = new_object(1, last, Instance(id=1, points=BOX), CODE)
+    unseen = not_looked_at_before(known, [new], scans, upright)
+    changes = changes_between(
+        [new], last - 1, last, CONFIG, not_seen=not_seen_in(with_not_seen(scans, unseen))
+    )
+    told = [k for k in ("added", "discovered", "not_seen", "removed") if getattr(changes, k)]
+    return told, sorted(unseen)
+
+
+@pytest.mark.parametrize("upright", [True, False])
+def test_new_where_the_floor_was_bare_is_added_and_where_no_scan_looked_discovered(upright):
+    assert found_new(THERE, upright=upright) == (["added"], [])
+    assert found_new(ELSEWHERE, upright=upright) == (["discovered"], [0])
+
+
+def test_it_came_since_the_last_scan_that_looked():
+    assert found_new(THERE, ELSEWHERE) == (["added"], [1])
+    assert found_new(ELSEWHERE, THERE) == (["added"], [])
+    assert found_new(ELSEWHERE, ELSEWHERE, ELSEWHERE) == (["discovered"], [0, 1, 2])
+
+
+def test_what_stood_there_before_was_looked_at():
+    other = new_object(0, 0, Instance(id=1, points=BOX + [0.1, 0.1, 0.0]), CODE)
+    assert found_new(ELSEWHERE, known=[other]) == (["added"], [])
+    later = new_object(0, 1, Instance(id=1, points=BOX), CODE)
+    assert found_new(ELSEWHERE, known=[later]) == (["discovered"], [0])  # that scan did not see it
+
+
+def test_a_scan_that_cannot_tell_is_taken_to_have_looked():
+    assert found_new(np.zeros((0, 3))) == (["added"], [])
+    assert found_new(ELSEWHERE, frame=Frame(unknown=True)) == (["added"], [])
+    assert found_new(np.zeros((0, 3)), ELSEWHERE) == (["added"], [1])
+
+
+def test_earlier_scans_lie_where_their_frames_say():
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = [[0, -1, 0], [1, 0, 0], [0, 0, 1]], [30.0, 1.0, 0.2]
+    there = apply_pose(np.linalg.inv(T), THERE)
+    assert found_new(there, frame=Frame(T_scene_scan=T)) == (["added"], [])
+    assert found_new(there) == (["discovered"], [0])
+
+
+def test_few_points_of_a_wide_floor_are_a_look_and_a_room_keeps_its_columns():
+    assert column_side_m(floor([0, 0], [4, 3], count=6000)) == CELL_M
+    wide = floor([-40, -30], [40, 30], count=6000)
+    assert column_side_m(wide) > 3 * CELL_M
+    assert found_new(wide) == (["added"], [])
+    assert looked_at_upright(BOX, Columns([wide])) < LOOKED_AT  # as a room's it would tell too little
+
+
+def test_an_object_that_was_discovered_is_known_from_then_on():
+    o = seen_again(
+        new_object(1, 1, Instance(id=1, points=BOX), CODE),
+        Instance(id=1, points=BOX),
+        Observation(scan=2, instance=1, T_ref_scan=np.eye(4), score=1.0, rms_m=0.0, converged=True),
+    )
+    seen = {0: (o.id,)}
+    assert changes_between([o], 0, 1, CONFIG, not_seen=seen).discovered == (o.id,)
+    assert changes_between([o], 0, 2, CONFIG, not_seen=seen).discovered == (o.id,)
+    assert changes_between([o], 1, 2, CONFIG, not_seen=seen).static == (o.id,)
+    assert changes_between([o], 0, 1, CONFIG).added == (o.id,)

@@ -37,7 +37,15 @@ def pair(whole=0, narrow=False):
 
 
 def decided(
-    odds, *, partner=None, now=0.0, narrow=False, scale=(1.0, 1.0, 1.0), motion="upright", doubtful=()
+    odds,
+    *,
+    partner=None,
+    now=0.0,
+    narrow=False,
+    scale=(1.0, 1.0, 1.0),
+    motion="upright",
+    doubtful=(),
+    both_known=False,
 ):
     """What becomes of one mask whose halves have `odds` (others, 2). `doubtful`: others that something hardly is."""
     odds = np.asarray(odds, float)
@@ -49,6 +57,7 @@ def decided(
         odds={0: now},
         least=LEAST_GAIN[motion],
         doubtful=dict(doubtful),
+        both_known=both_known,
     )
     return chosen([pair(narrow=narrow)], wholes, lambda _, others: dict(np.ndenumerate(odds[others])))
 
@@ -170,3 +179,10 @@ def test_no_cloud_is_divided_or_named_twice_and_the_best_come_first():
         division(2, (None, 6), 3.0),
     )
     assert compatible([free, again, clash, best]) == [best, free]
+
+
+def test_once_more_in_any_orientation_both_halves_must_be_known():
+    one, both = [[-5, 9], [-5, -5]], [[-5, 9], [9, -5]]
+    for again in (False, True):
+        assert bool(decided(one, narrow=True, motion="free", both_known=again)) is not again
+        assert decided(both, narrow=True, motion="free", both_known=again)

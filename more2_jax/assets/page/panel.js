@@ -1,6 +1,6 @@
 // What is read: the sentence, the list, the counts, the selected object. Names go in as text only.
 
-const STATUS_WORDS = { moved: "moved", added: "added", removed: "removed", static: "stayed", not_seen: "not seen" };
+const STATUS_WORDS = { moved: "moved", added: "added", removed: "removed", static: "stayed", not_seen: "not seen", discovered: "discovered" };
 
 function element(name, attributes = {}, ...children) {
   const made = document.createElement(name);
