@@ -179,7 +179,7 @@ def added(
             changed = [f.object for f, s in zip(found, seen, strict=True) if s.accumulated]
             objects = embed_accumulated(prior, objects, changed)
     missing, left = mended.left_over([(f.object, f.instance) for f in found])
-    unseen = not_looked_at(objects, missing, level, frame.T_scene_scan, scene.upright)
+    unseen = not_looked_at(objects, missing, level, frame, scene.upright)
     fresh = new_objects(next_number(objects, scene.scans), index, left, whole.instances, codes, frame)
     chance = chances(identified, objects, fresh, config)
     objects, frame = as_given([*mended.whole(objects), *fresh.values()], index, frame, T_level_scan)

@@ -16,7 +16,7 @@ from scipy.spatial import KDTree
 
 from more2_jax.geometry.poses import Points, apply_pose
 from more2_jax.tracking.objects import accumulated_points, observation_in, place_of, points_of
-from more2_jax.types import Scan, ScanRecord, SceneObject
+from more2_jax.types import Frame, Scan, ScanRecord, SceneObject
 
 CELL_M = 0.15  # a side of a column of the place: scans hold a point every few centimeters
 SPACINGS = 4.0  # between neighboring points, that a side has at least: four points of a floor in a column
@@ -29,14 +29,17 @@ def not_looked_at(
     objects: Sequence[SceneObject],
     missing: Sequence[int],
     scan: Scan,
-    T_scene_scan: Float[np.ndarray, "4 4"],
+    frame: Frame,
     upright: bool,
 ) -> tuple[str, ...]:
-    """Ids of those `missing` objects whose last place the scan did not look at; none where it has no background."""
-    if len(scan.background) < LEAST_BACKGROUND or not len(missing):
+    """Ids of those `missing` objects whose last place the scan, which lies in `frame`, did not look at.
+
+    A scan without background, or of unknown frame, is taken to have looked everywhere.
+    """
+    if len(scan.background) < LEAST_BACKGROUND or frame.unknown or not len(missing):
         return ()
     clouds = (scan.background, *(i.points for i in scan.instances))
-    share = share_looked_at((apply_pose(T_scene_scan, points) for points in clouds), upright)
+    share = share_looked_at((apply_pose(frame.T_scene_scan, points) for points in clouds), upright)
     return tuple(objects[k].id for k in missing if share(last_place(objects[k])) < LOOKED_AT)
 
 
@@ -45,7 +48,7 @@ def not_looked_at_before(
 ) -> dict[int, tuple[str, ...]]:
     """By earlier scan, the ids of `fresh` objects whose place it did not look at: of the scans since one that did.
 
-    `objects`: those known before. A scan without background, or of unknown frame, is taken to have looked.
+    `objects`: those known before. What is taken to have looked is as for `not_looked_at`.
     """
     unseen = dict[int, tuple[str, ...]]()
     for scan in reversed(scans):

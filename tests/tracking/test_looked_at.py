@@ -48,8 +48,8 @@ def place(T=None):
 
 
 def missed(background, *clouds, T=None, upright=True, o=None):
-    T = np.eye(4) if T is None else T
-    return not_looked_at([o or place()], [0], scan(background, *clouds), T, upright)
+    frame = Frame() if T is None else Frame(T_scene_scan=T)
+    return not_looked_at([o or place()], [0], scan(background, *clouds), frame, upright)
 
 
 @pytest.mark.parametrize("upright", [True, False])
@@ -76,8 +76,11 @@ def test_a_ceiling_or_a_lamp_over_the_place_tells_nothing():
     assert missed(np.concatenate([floor([-4, 0], [1, 3]), floor([0, 0], [4, 3], 2.5)])) == ID
 
 
-def test_a_scan_without_background_cannot_tell():
+def test_a_scan_without_background_or_of_unknown_frame_cannot_tell():
     assert missed(np.zeros((0, 3))) == ()
+    far = scan(ELSEWHERE)
+    assert not_looked_at([place()], [0], far, Frame(), True) == ID
+    assert not_looked_at([place()], [0], far, Frame(unknown=True), True) == ()
 
 
 def test_it_is_the_scans_place_in_the_scene_that_counts():
