@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pieces
+import pytest
 from scipy.spatial.transform import Rotation
 
 from more2_jax.config import FieldRegistration, preset
@@ -16,6 +17,7 @@ CONFIG = dataclasses.replace(preset("field", upright=True), registration=FIELD)
 MOVED = {0: (0.0, [0.0, 0, 0]), 1: (75.0, [0.4, 1.5, 0]), 2: (-160.0, [1.0, -0.5, 0])}
 
 
+@pytest.mark.slow
 def test_objects_are_found_where_they_went():
     prior = load_prior("small")
     poses = {

@@ -29,6 +29,7 @@ def exact(tiny_prior, batch):
         return answered(tiny_prior, batch[1]), gradient_of(tiny_prior, batch[1])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("parts", "turns_stay", "least"),
     [

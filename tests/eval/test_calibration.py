@@ -130,6 +130,7 @@ def test_thinned_rooms_are_parts_of_the_rooms_and_not_all_the_same():
         assert np.isin(odds, pair.odds(PLANTED)).all()
 
 
+@pytest.mark.slow
 def test_pairs_are_weighed_as_the_package_weighs_them(tiny_prior):
     scene = known_scene(copies=("a", "b", "c"), scans=3)
     config = preset("robust", upright=True)

@@ -40,6 +40,7 @@ def closed(prior, pairs):
     return closed_poses(prior, pairs, scans, codes, [SLIP @ TRUE] * len(pairs), CONFIG)
 
 
+@pytest.mark.slow
 def test_slips_of_pairs_are_taken_back_each_as_if_alone(prior):
     pairs = [seen_twice(k) for k in range(2)]
     together = closed(prior, pairs)

@@ -164,6 +164,7 @@ def test_a_peer_learns_and_repeats_exactly(with_tiny, tmp_path, monkeypatch):
     assert any(np.abs(x - y).max() > 1e-3 for x, y in moved)
 
 
+@pytest.mark.slow
 def test_validation_draws_the_same_shapes_for_all_weights(with_tiny, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(train, "SAMPLES", SampleConfig(queries=16, raw_points=64, max_views=2))
 
@@ -215,6 +216,7 @@ def test_what_is_shipped():
     assert max(sizes) < 1e6 and sum(sizes) < 3e6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["rpmnet", "geotransformer"])
 @pytest.mark.parametrize("degrees", [0, 20])
 def test_shipped_weights_find_a_small_turn_of_a_whole_cloud(degrees, name):
@@ -225,6 +227,7 @@ def test_shipped_weights_find_a_small_turn_of_a_whole_cloud(degrees, name):
     np.testing.assert_allclose(found[2, :3], [0, 0, 1], atol=1e-6)
 
 
+@pytest.mark.slow
 def test_shipped_weights_enclose_a_box():
     box = trimesh.creation.box((1.0, 0.8, 0.6))
     cloud = np.asarray(trimesh.sample.sample_surface(box, 2000, seed=0)[0]) + 7

@@ -42,6 +42,7 @@ def test_debiased_clouds_and_queries_move_together(seen):
     assert len(outside) == len(seen["uniform"]) and reach.min() >= BOX - 1e-9 and reach.max() > 1.9 * BOX
 
 
+@pytest.mark.slow
 def test_scores_are_the_same_in_another_unit_and_place(seen, tiny_prior):
     """In float64, where nothing but rounding is left. The random field is far too large or small: its size counts."""
     few = dict(seen) | {name: seen[name][:300] for name in ("near", "uniform")}

@@ -219,6 +219,7 @@ def amid(points, rest, real=None):
     return surrounded(as_surface(points), jnp.asarray(rest, jnp.float32), jnp.asarray(mask))
 
 
+@pytest.mark.slow
 def test_a_whole_fits_a_half_whose_rest_lies_around_it():
     """A mask that is cut: at the true pose nothing is amiss, and alignment does not slide the whole onto the half."""
     points, _ = box_points(np.random.default_rng(8), (1.6, 0.5, 0.4), 768)

@@ -151,6 +151,7 @@ def observed(prior, clouds):
     return [ObservedObject(points=p, embedding=e) for p, e in zip(clouds, embed(prior, clouds), strict=True)]
 
 
+@pytest.mark.slow
 def test_in_any_orientation_the_evidence_is_that_of_the_best_pose(tiny_prior):
     rng = np.random.default_rng(3)
     new, old = (

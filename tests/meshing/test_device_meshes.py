@@ -133,6 +133,7 @@ def test_nothing_lies_below_the_floor(hard, made):
     assert made["box"].vertices[:, 2].min() < WORLD_M[2] - 0.39
 
 
+@pytest.mark.slow
 def test_objects_of_the_demo_have_the_hosts_meshes(prior):
     """One scan's clouds as they are; and the same three times, as of several scans."""
     scan = read_scan(demo_scan_paths()[0])
@@ -194,6 +195,7 @@ def test_neither_padding_nor_order_nor_company_changes_a_mesh(tiny_prior, noisy_
     assert_equal(meshes_of(padded, noisy_boxes[-1:])[0], alone[-1])
 
 
+@pytest.mark.slow
 def test_an_accelerator_makes_them_side_by_side(tiny_prior, noisy_boxes, alone, monkeypatch):
     """As its programs are written: rows mapped over at once, fillers left out, no more drawn than memory holds."""
     drawn, config = [], dataclasses.replace(LITTLE, memory_mb=3 * engine.OBJECT_MB + 1)
@@ -207,6 +209,7 @@ def test_an_accelerator_makes_them_side_by_side(tiny_prior, noisy_boxes, alone, 
     jax.clear_caches()
 
 
+@pytest.mark.slow
 def test_what_there_is_no_room_for_is_made_on_the_host(tiny_prior, noisy_boxes, alone, monkeypatch):
     """`IsoSurface` tells (`test_device_isosurface`); here the second has too little."""
     most = sorted(len(m.vertices) for m in alone[:2])

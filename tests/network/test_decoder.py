@@ -115,6 +115,7 @@ def test_distance_is_finite_far_away(prior):
     assert np.isfinite(far).all() and (np.abs(far) <= 1).all()
 
 
+@pytest.mark.slow
 def test_dropout_only_while_training():
     config = PriorConfig(
         encoder=EncoderConfig(

@@ -92,6 +92,7 @@ def test_both_modes_agree_with_central_differences(prior64, slope):
     assert_close(slope(at, prior64), differences(lambda x: value_of_shift(x, prior64), at), 1e-6)
 
 
+@pytest.mark.slow
 def test_forward_over_reverse_agrees_with_differences_of_gradients(prior64):
     at = np.zeros(3)
     found = jax.jit(jax.hessian(of_shift))(at, prior64)

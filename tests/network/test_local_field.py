@@ -311,6 +311,7 @@ def test_a_field_with_normals_moves_with_the_object_and_depends_on_them(seeing, 
             np.testing.assert_array_equal(getattr(blind, name), getattr(embedding, name))
 
 
+@pytest.mark.slow
 def test_gradients_with_normals_are_finite_where_few_are_known(seeing, cloud):
     mask, normals = jnp.arange(len(cloud)) < 20, jnp.zeros_like(cloud).at[0, 2].set(1.0)
 

@@ -36,6 +36,7 @@ def test_checkpoint_that_torch_saved_agrees_with_what_torch_computed():
     assert max(deviation.values()) <= 1e-5, deviation
 
 
+@pytest.mark.slow
 def test_full_width_checkpoint_agrees_with_the_oracle(tmp_path):
     weights = oracles.random_weights((32, 32, 64, 64, 128, 256, 512), 256, 768, seed=0)
     assert sum(w.size for w in weights.values()) == 7_395_808  # the published size

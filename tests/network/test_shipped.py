@@ -66,6 +66,7 @@ def agree(found, expected, most):
 encode_double = jax.jit(encode_ordered)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", PRIORS)
 def test_shipped_weights_are_equivariant_up_to_ties_in_single_precision(name):
     """The whole way from clouds kilometers apart, in float32: to 1e-4, but for clouds in which rounding decides.

@@ -168,6 +168,7 @@ def test_points_beside_those_of_the_encoder_are_read(prior, cloud):
     assert np.abs(field(prior, other, q) - field(prior, embedding, q)).max() > 1e-3
 
 
+@pytest.mark.slow
 def test_gradients_are_finite_with_few_points_and_one_normal(prior, cloud):
     points = cloud[0]
     mask, normals = jnp.arange(len(points)) < 20, jnp.zeros_like(points).at[0, 2].set(1.0)

@@ -238,6 +238,7 @@ def outcome(prior, observations, config, points, pose, code):
     )
 
 
+@pytest.mark.slow
 def test_derivatives_in_both_modes_are_those_of_central_differences(in_float64):
     prior, observations = in_float64
     config = dataclasses.replace(CONFIG, steps=3, points=24)

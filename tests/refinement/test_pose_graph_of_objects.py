@@ -73,6 +73,7 @@ def off(o, true):
     return np.sqrt(np.mean(np.sum((o.points - true) ** 2, axis=1)))
 
 
+@pytest.mark.slow
 def test_slips_shrink_to_a_fiftieth_and_points_follow_their_poses(prior):
     o, true = seen_with_slips(prior)
     (new,) = refine_object_poses(prior, [o], CONFIG)

@@ -85,6 +85,7 @@ def test_registering_x_to_tx_recovers_t_from_starts_that_are_off(prior, clouds, 
         np.testing.assert_allclose(found[:, :2, 2], 0, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_next_to_nothing_half_a_turn_and_the_way_back(prior, clouds):
     """With starts of its own."""
     chair = clouds[:1] * 4
@@ -124,6 +125,7 @@ def test_what_stands_in_masked_rows_changes_nothing(prior, clouds, junk):
     np.testing.assert_allclose(found, clean, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_flat_straight_and_single_points_give_finite_poses(prior, clouds):
     cloud = clouds[0]
     odd = [cloud * [1, 1, 0], cloud * [1, 0, 0], cloud[:1], np.repeat(cloud[:2], 10, axis=0)]
@@ -151,6 +153,7 @@ def test_the_loss_returned_is_that_of_the_pose_returned(prior, clouds):
     np.testing.assert_allclose(result.loss, expected, rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_scenes_of_like_size_share_one_program(prior, clouds):
     programs = []
     for count in (PIECES - 1, PIECES):

@@ -62,6 +62,7 @@ def clouds():
     return cloud + 0.01 * rng.normal(size=cloud.shape), turned
 
 
+@pytest.mark.slow
 def test_gradient_through_encoder_kabsch_and_refinement_agrees_with_finite_differences(tiny_prior, clouds):
     """In float64; with the codes given also forward, which the encoder is not made for."""
     rng = np.random.default_rng(0)
@@ -92,6 +93,7 @@ def test_gradient_through_encoder_kabsch_and_refinement_agrees_with_finite_diffe
                 assert float(forward) == pytest.approx(along, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_gradient_through_steps_on_the_fields_agrees_with_finite_differences(tiny_prior, clouds):
     """In float64 and over differences so small that they cross no kink of a ReLU, where a field's slope jumps."""
     rng = np.random.default_rng(0)

@@ -182,6 +182,7 @@ def test_the_loss_returned_is_that_of_the_pose_returned(tiny_prior, still):
     np.testing.assert_allclose(result.loss, expected, rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_of_several_candidates_the_one_that_ends_with_the_lowest_residual_is_returned(tiny_prior, still):
     pair = jax.tree.map(lambda x: x[:1], still.local())
     turns = jax.vmap(jaxlie.SO3.from_z_radians)(jnp.deg2rad(jnp.array([180.0, 2.0, 90.0])))
@@ -223,6 +224,7 @@ def test_records_of_another_encoder_are_refused_where_the_decoder_would_be_asked
         sdf(load_prior("small"), other, np.zeros((1, 1, 3)))
 
 
+@pytest.mark.slow
 def test_records_of_another_encoder_are_registered_where_the_prior_is_not_asked(tiny_prior):
     clouds, rng = furniture(), np.random.default_rng(1)
     poses = [pieces.random_pose(rng, upright=True) for _ in clouds]

@@ -99,6 +99,10 @@ SOURCES: dict[str, tuple[Callable[[Path], None], set[int], set[str | None]]] = {
     "3RScan/REFERENCE": (threerscan, {2, 3}, {"chair", "cabinet"}),
     "scene0000_00": (scannet, {2, 3}, {"chair", "cabinet"}),
 }
+QUICK = (
+    "--up y",
+    "scene0000_00",
+)  # of these; what else they run, tests of readers and segmentation run as well
 
 
 def script_with(words: str) -> str:
@@ -140,7 +144,9 @@ def test_every_block_of_the_page_is_run_here():
 
 
 @pytest.mark.no_cover
-@pytest.mark.parametrize("words", list(SOURCES))
+@pytest.mark.parametrize(
+    "words", [pytest.param(w, marks=[] if w in QUICK else [pytest.mark.slow]) for w in SOURCES]
+)
 def test_the_commands_of_a_source_make_a_scene(words, follow, quickly, tmp_path):
     write, instances, labels = SOURCES[words]
     write(tmp_path)
@@ -153,6 +159,7 @@ def test_the_commands_of_a_source_make_a_scene(words, follow, quickly, tmp_path)
     assert {x.label for x in scene.objects} == labels
 
 
+@pytest.mark.slow
 @pytest.mark.no_cover
 def test_a_scan_is_added_and_the_scene_exported(follow, quickly, tmp_path):
     labeled_ply(tmp_path)
@@ -230,6 +237,7 @@ def test_an_object_is_found_in_other_rooms(follow, tmp_path, capsys):
     assert "object_003" in told
 
 
+@pytest.mark.slow
 def test_settings_and_weights_are_told_and_published_weights_imported(follow, tmp_path, capsys):
     shutil.copy(DATA / "tiny_checkpoint.pt", tmp_path / "published.pt")
     shutil.copy(DATA / "tiny_checkpoint_reference.npz", tmp_path / "reference.npz")
@@ -259,6 +267,7 @@ BATCHES = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.no_cover
 def test_a_table_of_scenes_is_built(follow, quickly, tmp_path, monkeypatch, capsys):
     """By both commands of the guide, here by this process in place of workers and actors."""

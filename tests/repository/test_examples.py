@@ -102,12 +102,14 @@ def test_a_mesh_from_one_view_is_closed_and_its_verdict_follows_from_its_figures
     )  # centimeters: around the chair, if not its shape
 
 
+@pytest.mark.slow
 def test_a_later_scan_changes_no_earlier_pose(printed):
     text = printed(6)
     assert "found again: 7 of 7" in text
     assert "earlier poses unchanged: yes" in text
 
 
+@pytest.mark.slow
 def test_another_encoder_takes_the_place(printed):
     text = printed(7)
     assert number_after("matched by the own descriptor alone:", text) >= 4

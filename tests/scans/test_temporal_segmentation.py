@@ -132,6 +132,7 @@ def test_rigid_motion_of_all_scans_moves_the_answer_along():
         assert np.flatnonzero(found.changed).tolist() == [which - 1]
 
 
+@pytest.mark.slow
 def test_each_scan_may_lie_in_a_frame_of_its_own():
     """Turned about the vertical, tilted a little, meters apart: the pose is found, and the change as before."""
     (a, _), (b, in_b) = visit(0, FROM), visit(1, TO)
@@ -155,6 +156,7 @@ def test_what_one_scan_did_not_look_at_is_no_change():
     assert not found.changed.any()
 
 
+@pytest.mark.slow
 def test_order_of_points_and_of_scans_does_not_matter():
     (a, _), (b, _) = visit(0, FROM), visit(1, TO)
     order = np.random.default_rng(2).permutation(len(a.points))
@@ -165,6 +167,7 @@ def test_order_of_points_and_of_scans_does_not_matter():
     assert (swapped[1].instance == plain[0].instance).mean() > 0.99
 
 
+@pytest.mark.slow
 def test_three_scans_tell_more_than_two():
     """What was emptied in any scan has changed, though it stayed in another."""
     scans = [visit(0, FROM), visit(1, FROM), visit(2)]

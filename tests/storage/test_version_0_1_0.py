@@ -86,6 +86,7 @@ def test_settings_are_what_they_were(folder):
     assert (config.joint.steps, config.joint.points, config.meshing.resolution) == (3, 32, 8)
 
 
+@pytest.mark.slow
 def test_stored_weights_give_the_same_codes(tmp_path):
     """Of a file with the header of that version: `neighbours` as it spelled them, and one decoder, without normals."""
     with np.load(ROOT / "more2_jax/assets/weights/small.npz") as file:

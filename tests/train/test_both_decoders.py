@@ -61,6 +61,7 @@ def gradients(both, shapes, training):
     return [gradient(p) for p in (both, one_decoder(both, normals=True), one_decoder(both, normals=False))]
 
 
+@pytest.mark.slow
 def test_each_decoder_learns_what_it_would_learn_alone(gradients):
     (found, terms), seeing, bare = gradients
     assert set(terms) == {"sdf", "sign", "bare_sdf", "bare_sign"}
@@ -70,6 +71,7 @@ def test_each_decoder_learns_what_it_would_learn_alone(gradients):
         agree(found[name], alone["decoder"])
 
 
+@pytest.mark.slow
 def test_the_encoder_learns_from_both(gradients):
     """Its gradient is the sum of those that each decoder alone has for it."""
     both, seeing, bare = (tree["encoder"] for tree, _ in gradients)

@@ -79,6 +79,7 @@ def test_warm_start_takes_weights_of_a_decoder_without_normals(prior, tmp_path):
         started_warm(prior.config, str(tmp_path / "seeing.npz"), "mine")
 
 
+@pytest.mark.slow
 def test_a_step_of_the_decoder_leaves_the_encoder_to_the_bit(seeing, sample, training):
     mesh, state = device_mesh(1), initial_state(seeing, training)
     before = jax.device_get(state.params)

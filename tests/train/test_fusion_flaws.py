@@ -131,6 +131,7 @@ def views() -> tuple[jax.Array, jax.Array]:
     return jnp.asarray(0.4 * outward, jnp.float16), jnp.asarray(np.rint(127 * outward), jnp.int8)
 
 
+@pytest.mark.slow
 def test_points_of_a_scan_get_no_further_flaws():
     every = dict.fromkeys((f"{flaw}_probability" for flaw in ("augment", "junk", "drift", "fused")), 1.0)
     config = dataclasses.replace(CONFIG, noise=0.1, **every)

@@ -268,6 +268,7 @@ def clouds(views, other, config):
     return jax.vmap(lambda key: partial_cloud(key, *seen, config, 16))(KEYS)
 
 
+@pytest.mark.slow
 def test_flaws_happen_in_augmented_clouds_alone():
     certain = {f"{flaw}_probability": 1.0 for flaw in FLAWS}
     open_to_all = dataclasses.replace(CLEAN, augment_probability=0.6, **certain)

@@ -49,6 +49,7 @@ def run():
     return load_config(ROOT / "configs" / "tiny.yaml", TrainingRun)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("normals", [False, True])
 def test_a_picture_shows_what_was_seen_and_the_whole_beside_the_mesh(shards, run, normals):
     decoder = dataclasses.replace(run.model.decoder, normals=normals)

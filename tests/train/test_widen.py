@@ -112,6 +112,7 @@ def assert_same(narrow: dict[str, jax.Array], wide: dict[str, jax.Array]) -> Non
         np.testing.assert_allclose(wide[name], padded, rtol=0, atol=1e-4 * np.abs(before).max(), err_msg=name)
 
 
+@pytest.mark.slow
 def test_everything_new_is_reached_by_a_gradient():
     """At once, or after the one step that moves what leads from it off zero."""
     before_widening = narrow_prior()
@@ -168,6 +169,7 @@ def test_what_cannot_be_widened_is_refused_in_one_line(wanted, message):
     assert "\n" not in str(refused.value)
 
 
+@pytest.mark.slow
 def test_the_program_writes_what_training_starts_from(tmp_path):
     out = tmp_path / "wide.npz"
     program.main("small", ROOT / "configs" / "base.yaml", out)
