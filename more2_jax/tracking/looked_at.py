@@ -1,7 +1,8 @@
-"""Whether a scan looked at the place of an object: "removed" and "added" are said only of what was looked for.
+"""Whether a scan can tell that it lacks an object: "removed" and "added" are said only of what was looked for.
 
-A scan that saw a place has points there: of the object, of what stands there instead, or of the floor under it. Beyond
-the paper, which takes every scan to be complete.
+A scan that saw a place has points there: of what stands there instead, or of the floor under it. If it has the
+object's own surface there, it lacks a mask, not the object. Beyond the paper, which takes every scan to be complete and
+every mask to be there.
 """
 
 from __future__ import annotations
@@ -14,12 +15,16 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial import KDTree
 
+from more2_jax.geometry.near_points import NearPoints
 from more2_jax.geometry.poses import Points, apply_pose
 from more2_jax.tracking.objects import accumulated_points, observation_in, place_of, points_of
+from more2_jax.tracking.surroundings import around
 from more2_jax.types import Frame, Scan, ScanRecord, SceneObject
 
 CELL_M = 0.15  # a side of a column of the place: scans hold a point every few centimeters
 SPACINGS = 4.0  # between neighboring points, that a side has at least: four points of a floor in a column
+STILL_THERE = 0.5  # share of an object's points that lie on a scan's surfaces: it stands there without a mask
+NEAR_M = 0.03  # of such a surface; the spacing of what is remembered of a scan, where that is wider
 ABOVE_M = 0.1  # over an object's top: points higher than that tell nothing of its place
 LOOKED_AT = 0.35  # share of the place that a scan must have looked at to miss the object
 LEAST_BACKGROUND = 200  # points: a scan of objects alone does not tell where it looked
@@ -32,21 +37,26 @@ def not_looked_at(
     frame: Frame,
     upright: bool,
 ) -> tuple[str, ...]:
-    """Ids of those `missing` objects whose last place the scan, which lies in `frame`, did not look at.
+    """Ids of those `missing` objects of which the scan, which lies in `frame`, cannot tell that they are gone.
 
-    A scan without background, or of unknown frame, is taken to have looked everywhere.
+    It did not look at their last place, or still shows their surface there. A scan without background, or of unknown
+    frame, is taken to have looked everywhere.
     """
     if len(scan.background) < LEAST_BACKGROUND or frame.unknown or not len(missing):
         return ()
-    clouds = (scan.background, *(i.points for i in scan.instances))
-    share = share_looked_at((apply_pose(frame.T_scene_scan, points) for points in clouds), upright)
-    return tuple(objects[k].id for k in missing if share(last_place(objects[k])) < LOOKED_AT)
+
+    def clouds() -> Iterator[Points]:
+        for points in (scan.background, *(i.points for i in scan.instances)):
+            yield apply_pose(frame.T_scene_scan, points)
+
+    unsure = cannot_tell([last_place(objects[k]) for k in missing], clouds, upright)
+    return tuple(objects[k].id for k, u in zip(missing, unsure, strict=True) if u)
 
 
 def not_looked_at_before(
     objects: Sequence[SceneObject], fresh: Sequence[SceneObject], scans: Sequence[ScanRecord], upright: bool
 ) -> dict[int, tuple[str, ...]]:
-    """By earlier scan, the ids of `fresh` objects whose place it did not look at: of the scans since one that did.
+    """By earlier scan, the ids of `fresh` objects of which it cannot tell that it lacked them, back to one that can.
 
     `objects`: those known before. What is taken to have looked is as for `not_looked_at`.
     """
@@ -54,8 +64,11 @@ def not_looked_at_before(
     for scan in reversed(scans):
         if not fresh or len(scan.background) < LEAST_BACKGROUND or scan.frame.unknown:
             break
-        share = share_looked_at(clouds_of(objects, scan), upright, column_side_m(scan.background))
-        fresh = [o for o in fresh if share(last_place(o)) < LOOKED_AT]
+        spacing_m = spacing_of(scan.background)
+        unsure = cannot_tell(
+            list(map(last_place, fresh)), partial(clouds_of, objects, scan), upright, spacing_m
+        )
+        fresh = [o for o, u in zip(fresh, unsure, strict=True) if u]
         unseen[scan.index] = tuple(o.id for o in fresh)
     return {index: ids for index, ids in unseen.items() if ids}
 
@@ -78,20 +91,52 @@ def clouds_of(objects: Sequence[SceneObject], scan: ScanRecord) -> Iterator[Poin
             yield apply_pose(seen.frame.T_scene_scan, points_of(o, seen))
 
 
-def share_looked_at(
-    clouds: Iterable[Points], upright: bool, side_m: float = CELL_M
-) -> Callable[[Points], float]:
-    """What share of a place (scene's frame) a scan looked at that has these points."""
+def cannot_tell(
+    places: Sequence[Points], clouds: Callable[[], Iterator[Points]], upright: bool, spacing_m: float = 0.0
+) -> list[bool]:
+    """Of objects at these places (scene's frame), whether a scan cannot tell that it lacks them.
+
+    `clouds`: all that the scan shows, its background first. `spacing_m`: between neighboring points of that, where it
+    was thinned: columns, and what is near, are as wide as they need be.
+    """
     if upright:
-        return partial(looked_at_upright, room=Columns(clouds, side_m))
-    return partial(looked_at, room=KDTree(np.concatenate(list(clouds))))
+        room = Columns(clouds(), max(CELL_M, SPACINGS * spacing_m))
+        shares = [looked_at_upright(p, room) for p in places]
+    else:
+        tree = KDTree(np.concatenate(list(clouds())))
+        shares = [looked_at(p, tree) for p in places]
+    there = shares_still_there(places, clouds(), max(NEAR_M, spacing_m))
+    return [seen < LOOKED_AT or still >= STILL_THERE for seen, still in zip(shares, there, strict=True)]
 
 
-def column_side_m(background: Points) -> float:
-    """Wide enough for the points that are remembered of a scan, which are few in a building."""
+def shares_still_there(places: Sequence[Points], clouds: Iterator[Points], near_m: float) -> list[float]:
+    """Shares of places that lie on surfaces of a scan other than floor and walls; the first cloud is its background.
+
+    Of the other clouds, one after the other, only what lies about the places is held.
+    """
+    background, boxes = (
+        NearPoints(next(clouds)),
+        [(p.min(axis=0) - near_m, p.max(axis=0) + near_m) for p in places],
+    )
+    beside: list[list[Points]] = [[np.zeros((0, 3))] for _ in places]
+    for cloud in (c for c in clouds if len(c)):
+        low, high = cloud.min(axis=0), cloud.max(axis=0)
+        for (first, last), parts in zip(boxes, beside, strict=True):
+            if (low <= last).all() and (first <= high).all():
+                parts.append(cloud[((cloud >= first) & (cloud <= last)).all(axis=1)])
+    shares = list[float]()
+    for place, parts in zip(places, beside, strict=True):
+        surfaces = around(place, background, np.concatenate(parts), background)
+        distance, _ = KDTree(surfaces).query(place, distance_upper_bound=near_m)
+        shares.append(float(np.isfinite(distance).mean()))
+    return shares
+
+
+def spacing_of(background: Points) -> float:
+    """Distance between neighbors of the points that are remembered of a scan, which are few in a building; meters."""
     some = background[:: max(1, len(background) // 1000)]
     distance, _ = KDTree(background).query(some, k=2)
-    return max(CELL_M, SPACINGS * float(np.median(distance[:, 1])))
+    return float(np.median(distance[:, 1]))
 
 
 def last_place(o: SceneObject) -> Points:

@@ -12,12 +12,15 @@ from more2_jax.tracking.changes import changes_between, last_known, not_seen_in
 from more2_jax.tracking.looked_at import (
     CELL_M,
     LOOKED_AT,
+    SPACINGS,
+    STILL_THERE,
     Columns,
-    column_side_m,
+    cannot_tell,
     looked_at,
     looked_at_upright,
     not_looked_at,
     not_looked_at_before,
+    spacing_of,
     with_not_seen,
 )
 from more2_jax.tracking.objects import new_object, seen_again
@@ -187,9 +190,9 @@ def test_earlier_scans_lie_where_their_frames_say():
 
 
 def test_few_points_of_a_wide_floor_are_a_look_and_a_room_keeps_its_columns():
-    assert column_side_m(floor([0, 0], [4, 3], count=6000)) == CELL_M
+    assert SPACINGS * spacing_of(floor([0, 0], [4, 3], count=6000)) < CELL_M
     wide = floor([-40, -30], [40, 30], count=6000)
-    assert column_side_m(wide) > 3 * CELL_M
+    assert SPACINGS * spacing_of(wide) > 3 * CELL_M
     assert found_new(wide) == (["added"], [])
     assert looked_at_upright(BOX, Columns([wide])) < LOOKED_AT  # as a room's it would tell too little
 
@@ -205,3 +208,65 @@ def test_an_object_that_was_discovered_is_known_from_then_on():
     assert changes_between([o], 0, 2, CONFIG, not_seen=seen).discovered == (o.id,)
     assert changes_between([o], 1, 2, CONFIG, not_seen=seen).static == (o.id,)
     assert changes_between([o], 0, 1, CONFIG).added == (o.id,)
+
+
+# --- what stands where it stood, without a mask ---------------------------------------------------------------------
+
+
+def surface(box_low, box_high, count=3000):
+    """Points on the faces of a box."""
+    points = RNG.uniform(box_low, box_high, (count, 3))
+    axis, side = RNG.integers(0, 3, count), RNG.integers(0, 2, count)
+    points[np.arange(count), axis] = np.stack([box_low, box_high])[side, axis]
+    return points
+
+
+CABINET = surface([1.6, 0.7, 0.0], [2.4, 1.3, 0.8])
+
+
+@pytest.mark.parametrize("upright", [True, False])
+def test_a_surface_without_a_mask_is_neither_removed_nor_added(upright):
+    o = new_object(0, 0, Instance(id=1, points=CABINET), CODE)
+    again = surface([1.6, 0.7, 0.0], [2.4, 1.3, 0.8])
+    bare, unmasked = THERE, np.concatenate([THERE, again])
+    assert missed(bare, o=o, upright=upright) == ()
+    assert missed(unmasked, o=o, upright=upright) == ID
+    assert missed(bare, again, o=o, upright=upright) == ID  # in the mask of something else
+    new = new_object(0, 1, Instance(id=1, points=CABINET), CODE)
+    assert not_looked_at_before([], [new], records(bare), upright) == {}
+    assert not_looked_at_before([], [new], records(unmasked), upright) == {0: ID}
+
+
+@pytest.mark.parametrize(
+    ("low", "high"),
+    [
+        ([1.6, 0.7, 0.0], [2.0, 1.0, 0.5]),
+        ([1.8, 0.9, 0.0], [2.2, 1.1, 0.7]),
+        ([1.7, 0.8, 0.0], [2.5, 1.4, 0.9]),
+    ],
+)
+def test_another_thing_in_its_place_is_not_itself(low, high):
+    o = new_object(0, 0, Instance(id=1, points=CABINET), CODE)
+    assert missed(np.concatenate([THERE, surface(low, high)]), o=o) == ()
+    assert missed(THERE, surface(low, high), o=o) == ()
+
+
+def test_a_wall_behind_it_and_the_floor_under_it_are_not_its_surface():
+    wall = RNG.uniform([0, 1.32, 0], [4, 1.32, 2.5], (8000, 3))
+    flat = new_object(0, 0, Instance(id=1, points=surface([1.6, 1.28, 0.3], [2.4, 1.31, 1.1])), CODE)
+    assert missed(np.concatenate([THERE, wall]), o=flat) == ()
+    low = new_object(0, 0, Instance(id=1, points=surface([1.6, 0.7, 0.0], [2.4, 1.3, 0.02])), CODE)
+    assert missed(floor([0, 0], [4, 3], count=8000), o=low) == ()
+
+
+def test_half_of_it_says_so_and_many_places_are_told_as_one_by_one():
+    def clouds(share):
+        yield THERE
+        yield CABINET[CABINET[:, 0] < 1.6 + 0.8 * share]
+
+    assert 0.3 < STILL_THERE < 0.8
+    for share, unsure in ((0.2, False), (0.9, True)):
+        assert cannot_tell([CABINET], lambda s=share: clouds(s), True) == [unsure]
+        others = [CABINET + [dx, 0, 0] for dx in (-0.9, 0.9)]
+        together = cannot_tell([CABINET, *others], lambda s=share: clouds(s), True)
+        assert together == [unsure, *(cannot_tell([p], lambda s=share: clouds(s), True)[0] for p in others)]
