@@ -346,8 +346,8 @@ class Changes:
     static: tuple[str, ...] = ()
     added: tuple[str, ...] = ()
     removed: tuple[str, ...] = ()
-    not_seen: tuple[str, ...] = ()  # known before; the later scan did not look where they last stood
-    discovered: tuple[str, ...] = ()  # new; no scan before had looked where they stand
+    not_seen: tuple[str, ...] = ()  # known before; the later scan cannot tell that they are gone
+    discovered: tuple[str, ...] = ()  # new; no scan before can tell that they were not there
     probability: dict[str, float] = field(default_factory=dict)  # of what is said of an object, where known
 
 
@@ -378,7 +378,7 @@ class ScanRecord:
     skipped: tuple[Skipped, ...] = ()
     not_seen: tuple[
         str, ...
-    ] = ()  # ids of objects, known before or found since, whose place it did not look at
+    ] = ()  # ids of objects, known before or found since, that it cannot tell it lacks
     repairs: tuple[Repair, ...] = ()  # that it led to
     frame: Frame = field(default_factory=Frame, compare=False)
     background: Float[np.ndarray, "b 3"] = field(  # thinned, to look at; meters, in the scan's frame, float64

@@ -60,7 +60,7 @@ class Track:
 
 
 def state_in(o: SceneObject, scan: ScanRecord) -> State:
-    """Whether a scan shows an object, did not look where it stood last, or looked and has none of it."""
+    """Whether a scan shows an object, cannot tell whether it is there (`tracking.looked_at`), or has none of it."""
     if observation_in(o, scan.index) is not None:
         return "seen"
     return "not_seen" if o.id in scan.not_seen else "absent"

@@ -161,8 +161,8 @@ def phrase(v: Verdict) -> str:
         "static": "stayed where it was",
         "added": "added",
         "removed": "removed",
-        "not_seen": "not seen: the scan did not look where it stood",
-        "discovered": "discovered: no scan had looked here before",
+        "not_seen": "not seen: the scan did not look where it stood, or shows it without a mask",
+        "discovered": "discovered: no scan had looked here, or one shows it without a mask",
         "present": "here",
         "absent": "not here",
     }
