@@ -66,8 +66,8 @@ def pytree(cls: type[T]) -> type[T]:
 class PointCloud:
     """A padded point cloud; rows where `mask` is False carry no meaning.
 
-    `points` are meters relative to `origin`, which stays float64 on the host. So an object a kilometer from
-    zero keeps its precision in float32. Inside compiled programs `origin` is None.
+    `points` are meters relative to `origin`, float64 on the host: an object a kilometer from zero keeps its precision
+    in float32. Inside compiled programs `origin` is None.
     """
 
     points: Float[Array, "*batch n 3"] = quantity("position")  # meters, relative to `origin`
@@ -284,8 +284,9 @@ class Frame:
     T_scene_scan: Float[np.ndarray, "4 4"] = field(default_factory=lambda: np.eye(4))  # float64, row-major
     sigma_m: float = 0.0  # standard errors of what it makes of a place and of a direction; 0 where it was
     sigma_deg: float = 0.0  # taken as given
-    # As given the scan does not fit those before, and nothing tells how it lies: what moved, and how far, is in doubt.
-    unknown: bool = False
+    unknown: bool = (
+        False  # does not fit those before as given, and nothing tells how it lies: motions are in doubt
+    )
 
     @property
     def tilt_deg(self) -> float:
@@ -376,9 +377,7 @@ class ScanRecord:
     source: str
     instances: tuple[int, ...]
     skipped: tuple[Skipped, ...] = ()
-    not_seen: tuple[
-        str, ...
-    ] = ()  # ids of objects, known before or found since, that it cannot tell it lacks
+    not_seen: tuple[str, ...] = ()  # ids of objects, known then or since, that it cannot tell it lacks
     repairs: tuple[Repair, ...] = ()  # that it led to
     frame: Frame = field(default_factory=Frame, compare=False)
     background: Float[np.ndarray, "b 3"] = field(  # thinned, to look at; meters, in the scan's frame, float64

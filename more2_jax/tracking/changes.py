@@ -17,9 +17,8 @@ OPTIMISM = 3.0
 SURE = 2.0  # standard errors that a motion must exceed
 
 KINDS = ("moved", "static", "added", "removed", "not_seen", "discovered")
-NotSeen = Mapping[
-    int, Collection[str]
-]  # of a scan, the ids of missing objects whose place it did not look at
+# Of a scan, the ids of objects that it cannot tell it lacks.
+NotSeen = Mapping[int, Collection[str]]
 
 
 def changes_between(
