@@ -59,6 +59,11 @@ def pytree(cls: type[T]) -> type[T]:
     return decorate(cls, kw_only=True)  # type: ignore[call-arg]
 
 
+def no_points() -> Float[np.ndarray, "0 3"]:
+    """An empty cloud, of a scan that has none."""
+    return np.zeros((0, 3))
+
+
 # --- on the device: what stages take and return -------------------------------------------------------------
 
 
@@ -252,7 +257,7 @@ class AccumulatedObject:
     # Of each observation, where its scan's sensors stood, in that scan's frame; (0, 3) where not known.
     sensors: tuple[Float[np.ndarray, "_ 3"], ...]
     # What was no object in the scan that saw it first, in the object's frame: its floor is that of this room.
-    background: Float[np.ndarray, "b 3"] = field(default_factory=lambda: np.zeros((0, 3)))
+    background: Float[np.ndarray, "b 3"] = field(default_factory=no_points)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -270,9 +275,9 @@ class Scan:
     name: str
     source: str
     instances: tuple[Instance, ...]
-    background: Float[np.ndarray, "b 3"] = field(default_factory=lambda: np.zeros((0, 3)))
+    background: Float[np.ndarray, "b 3"] = field(default_factory=no_points)
     # Where its sensors stood, in its frame, meters; none: not known.
-    sensors: Float[np.ndarray, "s 3"] = field(default_factory=lambda: np.zeros((0, 3)))
+    sensors: Float[np.ndarray, "s 3"] = field(default_factory=no_points)
     skipped: tuple[Skipped, ...] = ()
     warnings: tuple[str, ...] = ()
 
@@ -284,9 +289,8 @@ class Frame:
     T_scene_scan: Float[np.ndarray, "4 4"] = field(default_factory=lambda: np.eye(4))  # float64, row-major
     sigma_m: float = 0.0  # standard errors of what it makes of a place and of a direction; 0 where it was
     sigma_deg: float = 0.0  # taken as given
-    unknown: bool = (
-        False  # does not fit those before as given, and nothing tells how it lies: motions are in doubt
-    )
+    # Does not fit those before as given, and nothing tells how it lies: what moved, and how far, is in doubt.
+    unknown: bool = False
 
     @property
     def tilt_deg(self) -> float:
@@ -380,12 +384,9 @@ class ScanRecord:
     not_seen: tuple[str, ...] = ()  # ids of objects, known then or since, that it cannot tell it lacks
     repairs: tuple[Repair, ...] = ()  # that it led to
     frame: Frame = field(default_factory=Frame, compare=False)
-    background: Float[np.ndarray, "b 3"] = field(  # thinned, to look at; meters, in the scan's frame, float64
-        default_factory=lambda: np.zeros((0, 3)), compare=False, repr=False
-    )
-    sensors: Float[np.ndarray, "s 3"] = field(  # where they stood, in the scan's frame, float64
-        default_factory=lambda: np.zeros((0, 3)), compare=False, repr=False
-    )
+    # In the scan's frame, meters, float64: its background, thinned, and where its sensors stood.
+    background: Float[np.ndarray, "b 3"] = field(default_factory=no_points, compare=False, repr=False)
+    sensors: Float[np.ndarray, "s 3"] = field(default_factory=no_points, compare=False, repr=False)
 
 
 @dataclass(frozen=True, kw_only=True)
