@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import TYPE_CHECKING, Any, Literal, TypeVar, dataclass_transform
 
 import flax.struct
@@ -15,6 +16,7 @@ from jax import Array
 from jaxtyping import Bool, Float, Integer
 
 T = TypeVar("T")
+NO_POINTS = partial(np.zeros, (0, 3))  # of a scan that has none
 
 if TYPE_CHECKING:
     AnyArray = Array  # to a checker of types; records between compiled calls hold NumPy arrays as well
@@ -57,11 +59,6 @@ def pytree(cls: type[T]) -> type[T]:
     """Makes `cls` a frozen, keyword-only dataclass that JAX maps over."""
     decorate: Callable[[type[T]], type[T]] = flax.struct.dataclass
     return decorate(cls, kw_only=True)  # type: ignore[call-arg]
-
-
-def no_points() -> Float[np.ndarray, "0 3"]:
-    """An empty cloud, of a scan that has none."""
-    return np.zeros((0, 3))
 
 
 # --- on the device: what stages take and return -------------------------------------------------------------
@@ -257,7 +254,7 @@ class AccumulatedObject:
     # Of each observation, where its scan's sensors stood, in that scan's frame; (0, 3) where not known.
     sensors: tuple[Float[np.ndarray, "_ 3"], ...]
     # What was no object in the scan that saw it first, in the object's frame: its floor is that of this room.
-    background: Float[np.ndarray, "b 3"] = field(default_factory=no_points)
+    background: Float[np.ndarray, "b 3"] = field(default_factory=NO_POINTS)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -275,9 +272,9 @@ class Scan:
     name: str
     source: str
     instances: tuple[Instance, ...]
-    background: Float[np.ndarray, "b 3"] = field(default_factory=no_points)
+    background: Float[np.ndarray, "b 3"] = field(default_factory=NO_POINTS)
     # Where its sensors stood, in its frame, meters; none: not known.
-    sensors: Float[np.ndarray, "s 3"] = field(default_factory=no_points)
+    sensors: Float[np.ndarray, "s 3"] = field(default_factory=NO_POINTS)
     skipped: tuple[Skipped, ...] = ()
     warnings: tuple[str, ...] = ()
 
@@ -385,8 +382,8 @@ class ScanRecord:
     repairs: tuple[Repair, ...] = ()  # that it led to
     frame: Frame = field(default_factory=Frame, compare=False)
     # In the scan's frame, meters, float64: its background, thinned, and where its sensors stood.
-    background: Float[np.ndarray, "b 3"] = field(default_factory=no_points, compare=False, repr=False)
-    sensors: Float[np.ndarray, "s 3"] = field(default_factory=no_points, compare=False, repr=False)
+    background: Float[np.ndarray, "b 3"] = field(default_factory=NO_POINTS, compare=False, repr=False)
+    sensors: Float[np.ndarray, "s 3"] = field(default_factory=NO_POINTS, compare=False, repr=False)
 
 
 @dataclass(frozen=True, kw_only=True)
