@@ -32,6 +32,7 @@ FIGURES = {
     "MR, paper's formula": ("MR", "paper"),
     "MRR": ("MRR", "strict"),
     "F1": ("added and removed, F1", ""),
+    "told as changed without a mask": ("told as changed without a mask", ""),
     "told whether it moved": ("told whether it moved", "strict"),
     "t-mAP": ("t-mAP", ""),
     "t-AP50": ("t-AP50", ""),

@@ -27,7 +27,7 @@ from eval.performance.stopwatch import clock, told
 from eval.scores.divided_masks import with_divided_masks
 from eval.scores.figures import Figure, Record, in_columns
 from eval.scores.temporal_ap import temporal_records
-from eval.scores.tracks import Track, changes_f1, score_tracks, tracks_of
+from eval.scores.tracks import Track, changes_f1, false_changes, score_tracks, tracks_of
 from more2_jax.config import SceneConfig
 from more2_jax.network.prior import Prior
 from more2_jax.network.shared_calls import side_by_side
@@ -63,6 +63,7 @@ def figures() -> list[Figure]:
         replace(error, column="strict", better="lower"),
         replace(share, name="told whether it moved", key="told.strict", column="strict"),
         replace(share, name="added and removed, F1", key="changes_f1", statistic="mean"),
+        replace(share, name="told as changed without a mask", key="false_change", better="lower"),
         *(replace(share, name=n, key=k, statistic="average_precision") for n, k in TEMPORAL.items()),
         time,
         replace(time, name="processor time a scene", key="cpu_seconds"),
@@ -154,7 +155,8 @@ def records_of(
     pairs = score_tracks(scene, tracks, right_deg, samples, says_motion=name.startswith(OURS))
     whole: Record = {**taken, "changes_f1": changes_f1(scene, tracks), "reason": reason}
     whole |= followed
-    return [{"method": name, **r} for r in [*pairs, whole]]
+    false: list[Record] = [{"false_change": x} for x in false_changes(scene, tracks)]
+    return [{"method": name, **r} for r in [*pairs, *false, whole]]
 
 
 PROGRAM = Program(

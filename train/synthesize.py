@@ -69,7 +69,7 @@ class Settings:
     attribution: str | None = None
     """Who is to be named, for LICENSES.md."""
     masks: str | None = None
-    """Of regime real: perfect (as without), cut, dirty, split, merged or mix."""
+    """Of regime real: perfect (as without), cut, dirty, split, merged, missed or mix."""
     lived_in: bool = False
     """Of regime real: 14 to 24 objects a room, sets that are alike, small things on furniture."""
     room_m: tuple[float, float] | None = None

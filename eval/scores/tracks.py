@@ -153,6 +153,23 @@ def changes_f1(scene: KnownScene, tracks: Sequence[Track]) -> float:
     return f1(said - open_, true)
 
 
+def false_changes(scene: KnownScene, tracks: Sequence[Track]) -> list[float]:
+    """Of every object that two scans in a row have, and only one of them a mask of: 1 if told as added or removed.
+
+    What no track holds is not told of: 0.
+    """
+    found = list[float]()
+    for k in range(1, len(scene.scans)):
+        for here, other in ((k, k - 1), (k - 1, k)):
+            for o in scene.objects:
+                masked = [o.instance.get(scan, LOST) != LOST for scan in (here, other)]
+                if masked != [True, False] or other not in o.T_scan_model:
+                    continue
+                t = track_with(tracks, here, o.instance[here])
+                found.append(float(t is not None and other not in t.instance and other not in t.not_seen))
+    return found
+
+
 def f1(predicted: set[str], truth: set[str]) -> float:
     """Harmonic mean of precision and recall of a set; 1 when both are empty."""
     if not predicted and not truth:

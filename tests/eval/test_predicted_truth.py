@@ -11,7 +11,7 @@ from eval.data.flyingshape import known
 from eval.data.masks import LOST
 from eval.data.truth import KnownScene
 from eval.scores.match_scores import match_scores
-from eval.scores.tracks import Track, changes_f1, score_tracks
+from eval.scores.tracks import Track, changes_f1, false_changes, score_tracks
 from train.rooms.visits import TrueObject
 
 TURN = {0: pose(10, [0, 0, 0]), 1: pose(90, [2, 0, 0], "x")}  # T_scan_room of two scans
@@ -100,6 +100,22 @@ def test_what_is_not_seen_has_neither_come_nor_gone(absent):
     assert changes_f1(gone, true_tracks(gone)) == 1
     assert changes_f1(gone, true_tracks(gone)[1:]) == 0
     assert changes_f1(unseen, true_tracks(unseen)[1:]) == 1
+
+
+@pytest.mark.parametrize("absent", [0, 1])
+@pytest.mark.parametrize("visible", [True, False])
+def test_what_is_told_of_a_thing_without_a_mask(absent, visible):
+    first, *others = true_tracks(SCENE)
+    kept = {k: i for k, i in SCENE.objects[0].instance.items() if k != absent}
+    scene = with_object(SCENE, 0, instance=kept | ({absent: LOST} if visible else {}))
+    gone = dataclasses.replace(first, instance=kept)
+    assert false_changes(scene, [gone, *others]) == [1.0]
+    assert false_changes(scene, [dataclasses.replace(gone, not_seen=frozenset({absent})), *others]) == [0.0]
+    assert false_changes(scene, [first, *others]) == [0.0]  # held to be another mask
+    assert false_changes(scene, others) == [0.0]
+    assert false_changes(SCENE, [gone, *others]) == []  # it has a mask in both
+    poses = {k: T for k, T in SCENE.objects[0].T_scan_model.items() if k != absent}
+    assert false_changes(with_object(SCENE, 0, instance=kept, T_scan_model=poses), [gone, *others]) == []
 
 
 @pytest.mark.parametrize("absent", [0, 1])

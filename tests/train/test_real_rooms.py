@@ -23,7 +23,8 @@ from train.rooms.depth_sensor import DepthSensor
 from train.rooms.furnishing import MOVED_M, furnish, overlap
 from train.rooms.fused_scan import ScanSettings
 from train.rooms.hand_held import Walk
-from train.rooms.mask_flaws import FOREIGN, LOST, MIX, SMALLER, draw_flaws, predicted_masks
+from train.rooms.mask_flaws import FOREIGN, LOST, MISSED, MIX, SMALLER, draw_flaws, predicted_masks
+from train.rooms.mask_truth import LOST as NO_MASK
 from train.rooms.mask_truth import Shown, shown_by
 from train.rooms.real_files import write_real_scene
 from train.rooms.real_visits import RealConfig, RealScene, real_scene
@@ -233,6 +234,9 @@ def test_flaws_do_what_they_say(seed):
     (both,) = {s.instance for s in shown.values() if s.merged}
     assert [s.merged for s in shown.values()].count(True) == 1
     assert sum(s.instance == both for s in shown.values()) == 2
+    mask, shown, share = masked("missed")
+    assert shown[1].instance == NO_MASK and not mask[label == 1].any()
+    assert sorted(share) == sorted(shown[k].instance for k in (0, 2)) and set(share.values()) == {(1, 0)}
 
 
 def test_ids_tell_nothing_and_crumbs_are_no_instances():
@@ -251,6 +255,9 @@ def test_the_mix_is_as_told_and_merges_once():
     for flaw in ("cut", "dirty", "split"):
         assert np.mean([d.count(flaw) / 7 for d in drawn]) == pytest.approx(MIX[flaw], abs=0.02)
     assert draw_flaws(3, "cut", rng) == ["cut"] * 3
+    missed = [f for _ in range(500) for f in draw_flaws(7, "missed", rng)]
+    assert set(missed) == {"perfect", "missed"}
+    assert missed.count("missed") / len(missed) == pytest.approx(MISSED, abs=0.02)
     assert sorted(draw_flaws(3, "merged", rng)) == ["merged", "perfect", "perfect"]
 
 

@@ -1,4 +1,4 @@
-"""Masks as a network predicts them: cut short, dirty, split, or two objects in one.
+"""Masks as a network predicts them: cut short, dirty, split, two objects in one, or none.
 
 An instance belongs to the object that most of its points truly show; damage is drawn object by object.
 """
@@ -12,22 +12,25 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial import KDTree
 
-Flaw = Literal["perfect", "cut", "dirty", "split", "merged"]
-Masks = Literal["perfect", "cut", "dirty", "split", "merged", "mix"]
+Flaw = Literal["perfect", "cut", "dirty", "split", "merged", "missed"]
+Masks = Literal["perfect", "cut", "dirty", "split", "merged", "missed", "mix"]
 MASKS: tuple[Masks, ...] = get_args(Masks)
 MIX: dict[Flaw, float] = {"perfect": 0.35, "cut": 0.2, "dirty": 0.2, "split": 0.15, "merged": 0.1}
 LOST = (0.25, 0.5)  # share of a cut mask's points that are gone
 FOREIGN = (0.1, 0.3)  # share of a dirty mask's points that are another's or nobody's
 REACH_M = 0.25  # such points lie at most so far from the object
 SMALLER = (0.2, 0.5)  # share of a split object's points in its smaller part
+MISSED = 0.25  # share of objects that get no mask where masks are missed
 TOUCHING_M = 1.0  # objects further apart are never merged
 FEWEST = 64  # points of an instance: smaller ones are not predicted
 
 
 def draw_flaws(count: int, masks: Masks, rng: np.random.Generator) -> list[Flaw]:
     """The flaw of each object of a scan; at most one merges."""
-    if masks != "mix":
-        flaws: list[Flaw] = [masks] * count
+    if masks == "missed":
+        flaws: list[Flaw] = ["missed" if x < MISSED else "perfect" for x in rng.random(count)]
+    elif masks != "mix":
+        flaws = [masks] * count
     else:
         names, shares = list(MIX), list(MIX.values())
         flaws = [names[k] for k in rng.choice(len(names), count, p=shares)]
@@ -47,7 +50,7 @@ def predicted_masks(
     Objects are dirtied before any is cut, split or merged, so that no one's damage repairs another's. Instances of
     fewer than `FEWEST` points are none.
     """
-    mask = label + 1
+    mask = np.where(np.isin(label, [k for k, f in flaws.items() if f == "missed"]), 0, label + 1)
     for flaw, change in (("dirty", _dirty), ("cut", _cut), ("split", _split), ("merged", _merged)):
         for k in (k for k, f in flaws.items() if f == flaw):
             if (mask == k + 1).sum() >= FEWEST:
