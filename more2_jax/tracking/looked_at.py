@@ -64,10 +64,8 @@ def not_looked_at_before(
     for scan in reversed(scans):
         if not fresh or len(scan.background) < LEAST_BACKGROUND or scan.frame.unknown:
             break
-        spacing_m = spacing_of(scan.background)
-        unsure = cannot_tell(
-            list(map(last_place, fresh)), partial(clouds_of, objects, scan), upright, spacing_m
-        )
+        places, clouds = [last_place(o) for o in fresh], partial(clouds_of, objects, scan)
+        unsure = cannot_tell(places, clouds, upright, spacing_of(scan.background))
         fresh = [o for o, u in zip(fresh, unsure, strict=True) if u]
         unseen[scan.index] = tuple(o.id for o in fresh)
     return {index: ids for index, ids in unseen.items() if ids}
@@ -76,7 +74,7 @@ def not_looked_at_before(
 def with_not_seen(
     scans: Sequence[ScanRecord], unseen: Mapping[int, tuple[str, ...]]
 ) -> tuple[ScanRecord, ...]:
-    """The scans, with more objects whose place they did not look at."""
+    """The scans, with more objects that they cannot tell they lack."""
     return tuple(
         dataclasses.replace(s, not_seen=(*s.not_seen, *unseen[s.index])) if s.index in unseen else s
         for s in scans
@@ -114,10 +112,8 @@ def shares_still_there(places: Sequence[Points], clouds: Iterator[Points], near_
 
     Of the other clouds, one after the other, only what lies about the places is held.
     """
-    background, boxes = (
-        NearPoints(next(clouds)),
-        [(p.min(axis=0) - near_m, p.max(axis=0) + near_m) for p in places],
-    )
+    background = NearPoints(next(clouds))
+    boxes = [(p.min(axis=0) - near_m, p.max(axis=0) + near_m) for p in places]
     beside: list[list[Points]] = [[np.zeros((0, 3))] for _ in places]
     for cloud in (c for c in clouds if len(c)):
         low, high = cloud.min(axis=0), cloud.max(axis=0)
