@@ -51,6 +51,7 @@ def test_each_part_is_rounded_and_little_changes(tiny_prior, batch, exact, parts
     assert least < cosine(gradient, exact[1]) < 1
 
 
+@pytest.mark.slow
 def test_nothing_is_rounded_afterwards(tiny_prior, batch, exact):
     again = answered(tiny_prior, batch[1])
     for name, value in exact[0].items():

@@ -111,6 +111,7 @@ def test_padding_has_no_gradient_and_real_points_have(prior64):
 # --- derivatives by the weights ---------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_change_of_all_weights_agrees_with_central_differences(prior64):
     points, leaves = jnp.asarray(clouds()), jax.tree.leaves(prior64)
     rng = np.random.default_rng(3)

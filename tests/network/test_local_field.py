@@ -170,6 +170,7 @@ def test_field_moves_and_grows_with_the_cloud(prior, cloud):
         np.testing.assert_allclose(distance(exact_prior, carried, there), still, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_gradients_are_finite_with_few_real_points(prior, cloud):
     mask = jnp.arange(len(cloud)) < 20
 

@@ -100,6 +100,7 @@ def test_next_to_nothing_half_a_turn_and_the_way_back(prior, clouds):
     assert_recovered([a @ b for a, b in zip(there, back, strict=True)], [np.eye(4)] * 4, chair)
 
 
+@pytest.mark.slow
 def test_without_a_step_the_start_on_the_surfaces_is_chosen(prior, clouds):
     poses = [pieces.random_pose(np.random.default_rng(k), upright=True) for k in range(PIECES)]
     starts = np.array([[off_by(T, d, 0, x) for d in (90, 2, 45)] for T, x in zip(poses, clouds, strict=True)])
@@ -109,6 +110,7 @@ def test_without_a_step_the_start_on_the_surfaces_is_chosen(prior, clouds):
     np.testing.assert_allclose(found, starts[:, 1], atol=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("junk", [1e6, np.nan])
 def test_what_stands_in_masked_rows_changes_nothing(prior, clouds, junk):
     clouds = [x[: 300 + 10 * k] for k, x in enumerate(clouds)]

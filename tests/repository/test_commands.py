@@ -99,10 +99,7 @@ SOURCES: dict[str, tuple[Callable[[Path], None], set[int], set[str | None]]] = {
     "3RScan/REFERENCE": (threerscan, {2, 3}, {"chair", "cabinet"}),
     "scene0000_00": (scannet, {2, 3}, {"chair", "cabinet"}),
 }
-QUICK = (
-    "--up y",
-    "scene0000_00",
-)  # of these; what else they run, tests of readers and segmentation run as well
+QUICK = ("scene0000_00",)  # of these; what else they run, tests of readers and segmentation run as well
 
 
 def script_with(words: str) -> str:

@@ -93,7 +93,8 @@ def test_the_wheel_holds_the_library_and_its_data(built):
 
 def test_the_sdist_builds_the_same_wheel(built, tmp_path):
     with tarfile.open(built[".gz"]) as archive:
-        archive.extractall(tmp_path, filter="data")
+        archive.extraction_filter = getattr(tarfile, "data_filter", None)  # Python 3.11.4 and later
+        archive.extractall(tmp_path)
     (source,) = tmp_path.iterdir()
     assert {"README.md", "CHANGELOG.md", "CITATION.cff", "LICENSE"} <= {p.name for p in source.iterdir()}
     build = [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", tmp_path / "again"]

@@ -57,6 +57,7 @@ def test_frame_and_unit_are_the_callers():
     np.testing.assert_allclose([vertices.min(0), vertices.max(0)], box.bounds, atol=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 1])
 def test_an_open_soup_is_wrapped_just_outside_itself(seed: int):
     rng = np.random.default_rng(seed)
