@@ -363,32 +363,6 @@ def test_apply_pose_of_anchor_is_the_position():
     assert np.ptp(shift, axis=0).max() < 1e-9
 
 
-def test_what_was_not_seen_is_told_so_and_not_as_removed():
-    changes = [dataclasses.replace(c, removed=(), not_seen=c.removed) for c in SCENE.changes]
-    gone = tuple(o for c in changes for o in c.not_seen)
-    scans = [dataclasses.replace(s, not_seen=gone) for s in SCENE.scans[1:]]
-    scene = dataclasses.replace(SCENE, changes=tuple(changes), scans=(SCENE.scans[0], *scans))
-    page = page_of(scene)
-    assert (
-        "not seen: the scan did not look where it stood, or shows it without a mask"
-        in page.buttons["object_002"]
-    )
-    assert "1 was not seen" in report_html(scene, CONFIG) and "was removed" not in report_html(scene, CONFIG)
-    told = {motion_text(scene.objects[2], c) for c in changes}
-    assert "not seen" in told and "removed" not in told
-
-
-def test_what_was_found_where_no_scan_had_looked_is_told_so_and_not_as_added():
-    changes = [dataclasses.replace(c, added=(), discovered=c.added) for c in SCENE.changes]
-    new = {o: c.to_scan for c in changes for o in c.discovered}
-    scans = [
-        dataclasses.replace(s, not_seen=tuple(o for o, k in new.items() if s.index < k)) for s in SCENE.scans
-    ]
-    text = report_html(dataclasses.replace(SCENE, changes=tuple(changes), scans=tuple(scans)), CONFIG)
-    assert new and "discovered: no scan had looked here, or one shows it without a mask" in text
-    assert "discovered" in text and "was added" not in text and "were added" not in text
-
-
 def test_mended_masks_are_listed():
     repairs = (
         Repair(object="object_001", instances=(3, 5, 6), share=0.92),

@@ -18,7 +18,15 @@ from more2_jax.scene import add_scan, start_scene
 from more2_jax.tracking.objects import motion_between
 from more2_jax.tracking.rooms import Rooms
 from more2_jax.tracking.scan_frame import sought_there
-from more2_jax.tracking.scan_height import Weighed, best_vote, common_height, doubtful
+from more2_jax.tracking.scan_height import (
+    BEGUN_APART_M,
+    OUT_OF_REACH_M,
+    Weighed,
+    begins_at,
+    best_vote,
+    common_height,
+    doubtful,
+)
 from more2_jax.types import Instance, LivingScene, ObservedObject, Scan
 
 pytestmark = pytest.mark.optimized  # scenes run for longer than their programs compile
@@ -184,3 +192,13 @@ def test_a_stray_point_far_away_changes_no_floor():
     floor = np.column_stack([rng.uniform(-3, 3, (4000, 2)), 0.4 + 0.003 * rng.normal(size=4000)])
     strays = np.array([[0.0, 0, -1e9], [0, 0, 1e9]])
     assert floor_height(np.concatenate([floor, strays])) == pytest.approx(0.4, abs=0.01)
+
+
+def test_lifts_that_are_near_begin_where_one_has_begun_and_near_ones_at_none():
+    near, far = BEGUN_APART_M - 0.001, BEGUN_APART_M + 0.001
+    for m in (1.5, -0.8):
+        assert begins_at(m, [0.0]) == m
+        assert begins_at(m + near, [0.0, m]) == begins_at(m - near, [0.0, m]) == m
+        assert begins_at(m + far, [0.0, m]) == m + far
+    assert begins_at(OUT_OF_REACH_M, [0.0, 0.12]) == begins_at(-0.05, [0.0, -0.12]) == 0.0
+    assert begins_at(OUT_OF_REACH_M + 0.01, [0.0]) == OUT_OF_REACH_M + 0.01
