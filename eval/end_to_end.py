@@ -24,8 +24,8 @@ from eval.peers.end_to_end import NAME, combined, without_learning
 from eval.peers.learned.methods import learned_stages
 from eval.peers.learned.registry import stated
 from eval.performance.stopwatch import clock, told
-from eval.scores.divided_masks import with_divided_masks
 from eval.scores.figures import Figure, Record, in_columns
+from eval.scores.mended_masks import with_added_masks, with_divided_masks
 from eval.scores.temporal_ap import temporal_records
 from eval.scores.tracks import Track, changes_f1, false_changes, score_tracks, tracks_of
 from more2_jax.config import SceneConfig
@@ -152,10 +152,11 @@ def records_of(
     taken = told(clock() - began)
     followed = temporal_records(scene, tracks)
     scene, tracks = with_divided_masks(scene, tracks)
+    false: list[Record] = [{"false_change": x} for x in false_changes(scene, tracks)]
+    scene, tracks = with_added_masks(scene, tracks)
     pairs = score_tracks(scene, tracks, right_deg, samples, says_motion=name.startswith(OURS))
     whole: Record = {**taken, "changes_f1": changes_f1(scene, tracks), "reason": reason}
     whole |= followed
-    false: list[Record] = [{"false_change": x} for x in false_changes(scene, tracks)]
     return [{"method": name, **r} for r in [*pairs, *false, whole]]
 
 

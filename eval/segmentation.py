@@ -22,9 +22,9 @@ from eval.harness.results import write_rows
 from eval.harness.tables import on_screen
 from eval.scores.figures import Figure, Record, rows_of
 from eval.scores.segment_scores import SEGMENT_FIGURES, overlaps, segment_records
+from more2_jax.geometry.segmentation import SegmentationConfig, segment_geometric
 from more2_jax.scans.files.json_file import read_json
 from more2_jax.scans.files.npz import read_arrays
-from more2_jax.scans.geometric_segmentation import SegmentationConfig, segment_geometric
 from more2_jax.scans.labeled_cloud import ReadOptions
 from more2_jax.scans.read_scan import read_cloud
 from more2_jax.scans.seen_empty import UnlabeledScan

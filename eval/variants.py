@@ -22,8 +22,8 @@ from eval.data.masks import DAMAGES, with_masks
 from eval.data.truth import KnownScene
 from eval.end_to_end import living_scenes
 from eval.harness.options import Masks
-from eval.scores.divided_masks import with_divided_masks
 from eval.scores.figures import Record
+from eval.scores.mended_masks import with_mended_masks
 from eval.scores.tracks import changes_f1, score_tracks, tracks_of
 from more2_jax.config import SceneConfig, from_dict, preset
 from more2_jax.network.prior import Prior, load_prior
@@ -99,7 +99,7 @@ def row_of(scenes: list[KnownScene], prior: Prior, config: SceneConfig, right_de
         began = time.process_time()
         *_, last = living_scenes(scene, prior, config)
         seconds.append(time.process_time() - began)
-        scene, tracks = with_divided_masks(scene, tracks_of(last))
+        scene, tracks = with_mended_masks(scene, tracks_of(last))
         pairs += score_tracks(scene, tracks, right_deg, 0, says_motion=True)
         f1.append(changes_f1(scene, tracks))
         wrong += sum(len(t.instance) - 1 for t in tracks)

@@ -66,7 +66,7 @@ MODULES = {
     "data.sampling": "train.shards.sampling",
     "data.scans": "more2_jax.scans.read_scan",
     "data.segment_groups": "more2_jax.scans.segment_groups",
-    "data.segmentation": "more2_jax.scans.geometric_segmentation",
+    "data.segmentation": "more2_jax.geometry.segmentation",
     "data.shapenet": "train.furniture.shapenet",
     "data.shapes": "train.shards.shapes",
     "data.shards": "train.shards.shards",

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from functools import partial
+from itertools import repeat
 from typing import Any
 
 import numpy as np
@@ -32,17 +33,18 @@ from more2_jax.tracking.leveling import as_given, level_by_objects, level_of, le
 from more2_jax.tracking.looked_at import not_looked_at, not_looked_at_before, with_not_seen
 from more2_jax.tracking.mask_borders import mend_borders
 from more2_jax.tracking.merged_masks import divide_merged
-from more2_jax.tracking.object_views import Views, few_sensors
+from more2_jax.tracking.object_views import Views
 from more2_jax.tracking.objects import SCENE_FRAME, accumulated, new_objects, next_number
 from more2_jax.tracking.regrouped import Regrouped
 from more2_jax.tracking.relocalize import known_object, relocalize, with_observations
 from more2_jax.tracking.room_points import Cleared, remembered, without_room
 from more2_jax.tracking.rooms import rooms_of
+from more2_jax.tracking.scan_record import record
 from more2_jax.tracking.split_masks import mend_splits
 from more2_jax.tracking.surroundings import surroundings, surroundings_of_objects
+from more2_jax.tracking.unmasked import add_unmasked, not_sought, without_unfound
 from more2_jax.types import (
     Embedding,
-    Frame,
     Instance,
     LivingScene,
     Mesh,
@@ -116,18 +118,29 @@ def who_is_who(
         compared = Comparison.of(prior, [o for o, _ in old], new, identified, config)
         return compared and mend(masks, compared)
 
-    def divided(masks: Regrouped, compared: Comparison) -> Regrouped | None:
-        return divide_merged(masks, compared, next_number(masks.objects, scene.scans))
-
-    mends = join_parts, divided, lambda m, compared: divided(m, compared) if m.divided else None
     with stage("match", len(instances)), rows_remembered():
         known = compare(masks)
-        for mend in mends if config.repair_masks else ():
+        for mend in mends_of_masks(scene, scan) if config.repair_masks else ():
             if mended := mended_by(mend, known):
                 del known  # one comparison at a time is in memory
                 known = compare(mended)
+            elif mend is without_unfound:
+                break
         masks, old, new, found = known
         return masks, old, new, with_left_over(found, config).without_seen()
+
+
+def mends_of_masks(scene: LivingScene, scan: Scan) -> Iterator[Mend]:
+    """Yields what mends masks, in turn; the last until nothing is left to do."""
+
+    def divided(masks: Regrouped, compared: Comparison) -> Regrouped | None:
+        return divide_merged(masks, compared, next_number(masks.objects, scene.scans))
+
+    yield join_parts
+    yield divided
+    yield lambda masks, compared: divided(masks, compared) if masks.divided else None
+    yield partial(add_unmasked, scans=scene.scans, scan=scan)
+    yield from repeat(without_unfound)
 
 
 def add_scan(
@@ -173,11 +186,10 @@ def added(
     pairs = [(f.object, f.instance) for f in found if config.repair_masks]
     mended = mend_splits(whole.objects, whole.instances, pairs, seen[: len(pairs)])
     objects = with_observations(mended.objects, mended.instances, found, seen)
-    objects, borders = with_borders_mended(objects, found, scene, level, config)
-    if config.accumulate_target:
-        with stage("encode", len(found)):
-            changed = [f.object for f, s in zip(found, seen, strict=True) if s.accumulated]
-            objects = embed_accumulated(prior, objects, changed)
+    objects, borders = with_borders_mended(objects, whole.masked(found), scene, level, config)
+    with stage("encode", len(found)) if config.accumulate_target else nullcontext():
+        changed = [f.object for f, s in zip(found, seen, strict=True) if s.accumulated]
+        objects = embed_accumulated(prior, objects, changed if config.accumulate_target else [])
     missing, left = mended.left_over([(f.object, f.instance) for f in found])
     unseen = not_looked_at(objects, missing, level, frame, scene.upright)
     fresh = new_objects(next_number(objects, scene.scans), index, left, whole.instances, codes, frame)
@@ -187,7 +199,8 @@ def added(
     repairs = (*whole.repairs, *whole.masks(found, fresh), *mended.repairs)
     scene = forgotten(scene, {id_ for r in repairs for id_ in r.absorbed})
     repairs = (*repairs, *cleared.repairs(index, objects, repairs), *borders)
-    scans = (*with_not_seen(scene.scans, before), record(index, scan, masks, skipped, frame, unseen, repairs))
+    earlier = with_not_seen(scene.scans, before, not_sought(whole, scene.scans))
+    scans = (*earlier, record(index, scan, masks, skipped, frame, unseen, repairs))
     changes = (*scene.changes, changes_between(objects, index - 1, index, config, chance, not_seen_in(scans)))
     return dataclasses.replace(scene, scans=scans, objects=tuple(objects), changes=changes, timing_s=timing)
 
@@ -369,27 +382,3 @@ def leveled_scan(
         T_level_first = None if first is None else first.frame.T_scene_scan
         T_level_scan = level_of(remembered(scan.background), T_level_first)
     return leveled(scan, T_level_scan), T_level_scan
-
-
-def record(
-    index: int,
-    scan: Scan,
-    instances: list[Instance],
-    skipped: tuple[Skipped, ...],
-    frame: Frame = SCENE_FRAME,
-    unseen: Sequence[str] = (),
-    repairs: tuple[Repair, ...] = (),
-) -> ScanRecord:
-    """What the scene remembers of a scan."""
-    return ScanRecord(
-        index=index,
-        name=scan.name,
-        source=scan.source,
-        instances=tuple(i.id for i in instances),
-        skipped=skipped,
-        not_seen=tuple(unseen),
-        repairs=repairs,
-        frame=frame,
-        background=remembered(scan.background),
-        sensors=few_sensors(scan),
-    )

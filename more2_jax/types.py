@@ -174,8 +174,7 @@ class Registration:
     rms_m: Float[Array, "*batch"] = quantity("length")
     # The pose stopped moving and explains both clouds.
     converged: Bool[Array, "*batch"] = quantity("invariant")
-    # The rest only of `SurfaceRegistration`.
-    # Of the surfaces: 0 none, 1 nothing of both clouds agrees.
+    # The rest only of `SurfaceRegistration`. Of the surfaces: 0 none, 1 nothing of both clouds agrees.
     misfit: Float[Array, "*batch"] | None = quantity("invariant", default=None)
     # Of (shift m, turn rad), about the target's local zero.
     covariance: Float[Array, "*batch 6 6"] | None = quantity("covariance", default=None)
@@ -365,6 +364,7 @@ class Repair:
     dropped: int = 0
     neighbor: str | None = None  # id of the object that they are of
     regained: int = 0  # points beside a mask that are the object's
+    unmasked: int = 0  # points of the object where no mask shows it, found as a new one of `instances`
     points: int = 0  # of the mask, before
     share: float = 1.0  # of the part, that lies on the whole; of points dropped or regained: beyond doubt
 

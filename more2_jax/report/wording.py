@@ -127,6 +127,9 @@ def repair_text(scan: ScanRecord, repair: Repair) -> str:
         if not repair.instances:
             return f"{scan.name}: one mask of the scan before held {both}"
         return f"{scan.name}: instance {repair.instances[0]} is {both} in one mask"
+    if repair.unmasked:
+        where = f"as instance {repair.instances[0]}" if repair.instances else "in the scan before"
+        return f"{scan.name}: {repair.unmasked} points without a mask are {repair.object}, {where}"
     if repair.dropped or repair.regained:
         return f"{scan.name}: {_border_text(repair)} ({repair.share:.0%} within half the tolerance)"
     sure = f"in parts ({repair.share:.0%} on it)"

@@ -9,9 +9,9 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float, Integer
 
+from more2_jax.geometry.segmentation import SegmentationConfig, segment_geometric
 from more2_jax.geometry.up_axis import R_UP
 from more2_jax.scans.formats.registry import FORMATS, WITH_DEPTH_FRAMES
-from more2_jax.scans.geometric_segmentation import SegmentationConfig, segment_geometric
 from more2_jax.scans.labeled_cloud import CUT_WITHOUT, LabeledCloud, ReadOptions, one_line
 from more2_jax.scans.large_instances import thinned_instances
 from more2_jax.scans.normal_sides import outward

@@ -2,7 +2,7 @@
 
 A voxel that another scan shows to be empty has changed. Between what changed and what stayed a minimal cut (Boykov and
 Jolly, 2001) runs along concave creases, so that a table moved by less than its width stays whole. Both sides are then
-clustered as in `geometric_segmentation`.
+clustered as in `geometry.segmentation`.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from more2_jax.geometry.room_alignment import (
     fit_from_any_yaw,
     room_shape,
 )
-from more2_jax.scans.geometric_segmentation import (
+from more2_jax.geometry.segmentation import (
     Segmentation,
     SegmentationConfig,
     boundary_planes,

@@ -68,7 +68,7 @@ def _where_any(**lists: list[Any]) -> dict[str, list[Any]]:
 
 def _repair_to_json(r: Repair) -> dict[str, Any]:
     lists = {"instances": [int(i) for i in r.instances], "absorbed": list(r.absorbed)}
-    others = {k: getattr(r, k) for k in ("divided", "dropped", "neighbor", "regained", "points")}
+    others = {k: getattr(r, k) for k in ("divided", "dropped", "neighbor", "regained", "unmasked", "points")}
     told = {k: v for k, v in others.items() if v}  # older readers know no others
     return {"object": r.object, **lists, **told, "share": float(r.share)}
 

@@ -101,12 +101,26 @@ class Comparison:
 
         Those of halves are small without being what people carry about.
         """
-        matcher = dataclasses.replace(self.matcher, candidates=CANDIDATES)
-        T = self.identified.frame.T_scene_scan
-        sides, seen = (list(old), list(new)), self.aligned.seen
-        aligned = align_candidates(self.prior, *sides, matcher, self.config.motion, T, seen)
+        aligned = self.align_others(old, new)
         if halves:
             known = dataclasses.replace(aligned.compared, portable=np.zeros(len(aligned.rows)))
             aligned = dataclasses.replace(aligned, compared=known)
-        odds = odds_of(aligned, matcher.search, self.config.motion, self.height_m())
+        odds = odds_of(aligned, self.matcher.search, self.config.motion, self.height_m())
         return {(k, i): z for (k, i), z in zip(odds.pairs.tolist(), odds.value.tolist(), strict=True)}
+
+    def poses_of_others(
+        self, old: Iterable[ObservedObject], new: Iterable[ObservedObject]
+    ) -> dict[tuple[int, int], tuple[float, Pose]]:
+        """As `odds_of_others`, with the pose that fits best: T_old_new."""
+        aligned, search, motion = self.align_others(old, new), self.matcher.search, self.config.motion
+        odds = odds_of(aligned, search, motion, self.height_m())
+        best = evidence_at(aligned, search, motion, self.height_m()).pose
+        T = aligned.T_old_new[np.arange(len(best)), best]
+        rows = zip(odds.pairs.tolist(), odds.value.tolist(), T, strict=True)
+        return {(k, i): (z, pose) for (k, i), z, pose in rows}
+
+    def align_others(self, old: Iterable[ObservedObject], new: Iterable[ObservedObject]) -> AlignedPairs:
+        """The likeliest pairs of clouds that were not compared, aligned."""
+        matcher = dataclasses.replace(self.matcher, candidates=CANDIDATES)
+        T, seen = self.identified.frame.T_scene_scan, self.aligned.seen
+        return align_candidates(self.prior, list(old), list(new), matcher, self.config.motion, T, seen)

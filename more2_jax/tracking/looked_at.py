@@ -72,12 +72,12 @@ def not_looked_at_before(
 
 
 def with_not_seen(
-    scans: Sequence[ScanRecord], unseen: Mapping[int, tuple[str, ...]]
+    scans: Sequence[ScanRecord], *unseen: Mapping[int, tuple[str, ...]]
 ) -> tuple[ScanRecord, ...]:
-    """The scans, with more objects that they cannot tell they lack."""
+    """The scans, with more objects, by scan, that they cannot tell they lack."""
+    more = {s.index: tuple(id_ for u in unseen for id_ in u.get(s.index, ())) for s in scans}
     return tuple(
-        dataclasses.replace(s, not_seen=(*s.not_seen, *unseen[s.index])) if s.index in unseen else s
-        for s in scans
+        dataclasses.replace(s, not_seen=(*s.not_seen, *more[s.index])) if more[s.index] else s for s in scans
     )
 
 

@@ -27,6 +27,7 @@ class Regrouped:
     halves: tuple[tuple[int, int], ...] = ()  # rows of instances that are one mask
     joined: tuple[JoinedMask, ...] = ()
     repairs: tuple[Repair, ...] = ()  # of objects
+    unmasked: tuple[int, int] = (0, 0)  # how many of the last objects and instances no mask shows
 
     @property
     def divided(self) -> bool:
@@ -48,4 +49,22 @@ class Regrouped:
                 for i, j in self.halves
                 if i in names and j in names
             ),
+            *(
+                Repair(object=names[i], instances=(x.id,), unmasked=len(x.points))
+                for i, x in enumerate(self.instances)
+                if i in names and self.is_unmasked(1, i)
+            ),
+            *(Repair(object=o.id, unmasked=len(o.points)) for o in self.unmasked_objects()),
         )
+
+    def masked(self, found: Sequence[Found]) -> list[Found]:
+        """Those found of which a mask shows both the object and the instance."""
+        return [f for f in found if not (self.is_unmasked(0, f.object) or self.is_unmasked(1, f.instance))]
+
+    def is_unmasked(self, side: int, row: int) -> bool:
+        """Whether no mask shows an object (side 0) or instance (1)."""
+        return row >= len((self.objects, self.instances)[side]) - self.unmasked[side]
+
+    def unmasked_objects(self) -> list[SceneObject]:
+        """The objects that no mask of the scan before shows."""
+        return self.objects[len(self.objects) - self.unmasked[0] :]

@@ -11,8 +11,8 @@ from eval.data.flyingshape import vertices_of
 from eval.data.masks import DAMAGES, with_masks
 from eval.end_to_end import figures, records_of
 from eval.scores.average_precision import ap_of_rows, ap_rows
-from eval.scores.divided_masks import with_divided_masks
 from eval.scores.figures import Figure, figure_row, rows_of
+from eval.scores.mended_masks import with_mended_masks
 from eval.scores.temporal_ap import THRESHOLDS, masks_of, overlaps, temporal_records
 from eval.scores.tracks import Track, tracks_of
 from more2_jax.storage.ply_files import write_points
@@ -223,7 +223,7 @@ def test_mended_masks_are_those_of_the_track_up_to_rounding():
     assert value([temporal_records(merged, [track])], "t_ap50") == pytest.approx(
         1 / 2
     )  # half the union: at 0.5
-    assert with_divided_masks(merged, [track])[1] == [track]  # a mask of one track is left alone
+    assert with_mended_masks(merged, [track])[1] == [track]  # a mask of one track is left alone
 
 
 def test_points_that_are_not_the_scans_are_refused():

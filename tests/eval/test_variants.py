@@ -42,7 +42,7 @@ def test_figures_count_pairs_and_a_failure_is_neither_near_nor_right(monkeypatch
     monkeypatch.setattr(
         eval.variants, "tracks_of", lambda _: [FakeTrack({0: 1, 1: 1})] * 6 + [FakeTrack({1: 9})]
     )
-    monkeypatch.setattr(eval.variants, "with_divided_masks", lambda scene, tracks: (scene, tracks))
+    monkeypatch.setattr(eval.variants, "with_mended_masks", lambda scene, tracks: (scene, tracks))
     monkeypatch.setattr(eval.variants, "score_tracks", lambda *_, **__: pairs)
     monkeypatch.setattr(eval.variants, "changes_f1", lambda *_: 0.5)
     count, right, wrong, below_5, below_15, registered, f1, told, seconds = row_of(

@@ -372,6 +372,8 @@ def test_mended_masks_are_listed():
         Repair(object="object_000", instances=(4,), dropped=40, points=900, share=0.95),
         Repair(object="object_002", dropped=7, neighbor="object_003", points=90, share=0.5),
         Repair(object="object_001", instances=(3,), regained=1200, points=3000, share=0.75),
+        Repair(object="object_004", instances=(9,), unmasked=800),
+        Repair(object="object_005", unmasked=70),
     )
     mended = dataclasses.replace(SCENE.scans[-1], repairs=repairs)
     text = report_html(dataclasses.replace(SCENE, scans=(*SCENE.scans[:-1], mended)), CONFIG)
@@ -385,4 +387,6 @@ def test_mended_masks_are_listed():
     )
     assert "7 of 90 points of object_002 (in an earlier scan) are object_003" in text
     assert "1200 points beside the 3000 of object_001 (instance 3) are part of it, and taken in (75%" in text
+    assert "friday: 800 points without a mask are object_004, as instance 9" in text
+    assert "friday: 70 points without a mask are object_005, in the scan before" in text
     assert "Masks are as they were given." in report_html(SCENE, CONFIG)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from more2_jax.scans.geometric_segmentation import SegmentationConfig, segment_geometric
+from more2_jax.geometry.segmentation import SegmentationConfig, segment_geometric
 from more2_jax.scans.seen_empty import EMPTIED, STAYED, UNKNOWN, UnlabeledScan
 from more2_jax.scans.temporal_segmentation import (
     ChangeConfig,

@@ -131,6 +131,7 @@ def test_folder_satisfies_the_schema(tmp_path):
         Repair(object="object_001", instances=(3,), dropped=4, points=90, share=0.75),
         Repair(object="object_001", dropped=4, neighbor="object_002", points=90, share=0.75),
         Repair(object="object_001", instances=(3,), regained=12, points=90, share=0.75),
+        Repair(object="object_001", instances=(9,), unmasked=700),
     ],
 )
 def test_what_was_mended_comes_back_and_only_what_is_said_of_it_is_written(tmp_path, repair):
@@ -142,7 +143,9 @@ def test_what_was_mended_comes_back_and_only_what_is_said_of_it_is_written(tmp_p
     schema = json.loads((Path(more2_jax.__file__).parent / "assets/scene.schema.json").read_text())
     jsonschema.validate(content, schema)
     (written,) = content["scans"][2]["repairs"]
-    said = {k for k in ("divided", "dropped", "neighbor", "regained", "points") if getattr(repair, k)}
+    said = {
+        k for k in ("divided", "dropped", "neighbor", "regained", "unmasked", "points") if getattr(repair, k)
+    }
     assert set(written) == {"object", "instances", "absorbed", "share", *said}
 
 

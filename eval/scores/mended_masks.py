@@ -1,4 +1,4 @@
-"""Scenes whose merged masks a method divided: each half is scored as a mask of its own."""
+"""Scenes whose masks a method mended: halves of divided masks, and masks that it added, are scored as masks."""
 
 from __future__ import annotations
 
@@ -14,6 +14,12 @@ from eval.data.masks import LOST
 from eval.data.truth import KnownObject, KnownScene
 from eval.scores.tracks import Track
 from more2_jax.geometry.poses import apply_pose
+from more2_jax.types import Instance
+
+
+def with_mended_masks(scene: KnownScene, tracks: Sequence[Track]) -> tuple[KnownScene, list[Track]]:
+    """The scene as if its masks had been those of the tracks, which get ids of their own."""
+    return with_added_masks(*with_divided_masks(scene, tracks))
 
 
 def with_divided_masks(scene: KnownScene, tracks: Sequence[Track]) -> tuple[KnownScene, list[Track]]:
@@ -32,6 +38,38 @@ def with_divided_masks(scene: KnownScene, tracks: Sequence[Track]) -> tuple[Know
             if owner is not None:
                 scene, tracks = _divided(scene, tracks, scan, mask, rows, owner, hidden)
     return scene, tracks
+
+
+def with_added_masks(scene: KnownScene, tracks: Sequence[Track]) -> tuple[KnownScene, list[Track]]:
+    """Of every instance that is no mask of its scan, says whose it is: of the object that it lies nearest.
+
+    Only an object without a mask (`LOST`) gains one, and only one.
+    """
+    tracks = list(tracks)
+    for scan in range(len(scene.scans)):
+        for n, track in enumerate(tracks):
+            known = {i.id for i in scene.scans[scan].instances}
+            if scan in track.instance and track.instance[scan] not in known:
+                id_ = 1 + max(known, default=0)
+                scene = _added(scene, scan, id_, track.seen[scan])
+                tracks[n] = dataclasses.replace(track, instance=track.instance | {scan: id_})
+    return scene, tracks
+
+
+def _added(scene: KnownScene, scan: int, id_: int, points: Float[np.ndarray, "n 3"]) -> KnownScene:
+    """One mask more, and the object that it shows."""
+    there = [o for o in scene.objects if scan in o.T_scan_model and o.mesh is not None]
+    nearest = min(there, key=lambda o: distance_m(points, o, scan), default=None)
+    objects = tuple(
+        dataclasses.replace(o, instance=o.instance | {scan: id_})
+        if o is nearest and o.instance.get(scan) == LOST
+        else o
+        for o in scene.objects
+    )
+    scans = list(scene.scans)
+    more = Instance(id=id_, points=points)
+    scans[scan] = dataclasses.replace(scans[scan], instances=(*scans[scan].instances, more))
+    return dataclasses.replace(scene, scans=tuple(scans), objects=objects)
 
 
 def _divided(

@@ -14,8 +14,8 @@ from scipy.spatial.transform import Rotation
 
 from more2_jax.cli.main import main
 from more2_jax.config import preset
+from more2_jax.geometry.segmentation import SegmentationConfig, segment_geometric
 from more2_jax.network.prior import init_prior, save_prior
-from more2_jax.scans.geometric_segmentation import SegmentationConfig, segment_geometric
 from more2_jax.scans.read_scan import read_scan
 from more2_jax.storage.scene_folder import load_scene, save_scene
 from more2_jax.types import Scan
