@@ -7,7 +7,8 @@
     <!-- end of figures -->
 
 One run: a line a figure, with intervals, a column a method; with `; lines = methods` the other way round, for runs of
-many methods. Several: a line a run, ours / the best peer.
+many methods. Several: a line a run, ours / the best peer. With `; over = scans` a line a method of one run, and in
+every cell the figure after each number of scans.
 """
 
 from __future__ import annotations
@@ -42,6 +43,10 @@ FIGURES = {
     "median RE of pairs": ("MedRE", "strict"),
     "within 5 cm": ("within 5 cm", "strict"),
     "RE < 5°": ("RE < 5°", "strict"),
+    "coverage": ("coverage", ""),
+    "median RE of objects": ("MedRE, strict", ""),
+    "Chamfer-L1 of objects": ("Chamfer-L1", ""),
+    "IoU of objects": ("IoU", ""),
     "mean RE": ("mean RE", "strict"),
     "median Chamfer-L1": ("median Chamfer-L1", "strict"),
     "Chamfer-L1": ("Chamfer-L1", "strict"),
@@ -83,6 +88,7 @@ FIGURES = {
     "processor time": ("processor time a scene", ""),
     "processor time a pair": ("processor time a pair", ""),
 }
+SCANS = re.compile(r"scans \d+")  # groups that are kept beside all scenes
 SENSE = {"higher": 1.0, "lower": -1.0}
 # What programs count, where it is not pairs.
 COUNTED = {"reconstruction": "objects", "segmentation": "objects"}
@@ -114,13 +120,14 @@ def main(keep: Path | None = None, name: str = "", docs: Path = DOCS) -> None:
 
 
 def kept_of(results: dict[str, Any]) -> dict[str, Any]:
-    """Of results.json, the figures over all scenes that pages may show, and what they belong to."""
+    """Of results.json, the figures that pages may show, over all scenes or by scans, and what they belong to."""
     wanted = set(FIGURES.values())
     fields = ("name", "column", "method", "value", "unit", "better", "count", "failures", "ci95", "scenes")
+    groups = {r["group"] for r in results["rows"] if SCANS.fullmatch(r["group"])} or {"all"}
     rows = [
-        {k: r[k] for k in fields}
+        {k: r[k] for k in fields} | ({} if r["group"] == "all" else {"group": r["group"]})
         for r in results["rows"]
-        if r["group"] == "all" and (r["name"], r["column"]) in wanted
+        if r["group"] in groups and (r["name"], r["column"]) in wanted
     ]
     facts = {k: results[k] for k in ("command", "date", "hardware", "versions")}
     return {**facts, "masks": results["settings"].get("masks", "true"), "rows": rows}
@@ -151,6 +158,8 @@ def table_of(what: str, figures: Path) -> str:
         runs[name] = json.loads(path.read_text(encoding="utf-8"))
     if len(runs) > 1:
         lines = of_several(runs, shown)
+    elif "over" in asked:
+        lines = over_groups(runs[names[0]], shown, asked["over"])
     elif asked.get("lines") == "methods":
         lines = of_methods(runs[names[0]], shown, asked.get("only", ""))
     else:
@@ -192,6 +201,22 @@ def of_methods(kept: dict[str, Any], shown: Sequence[str], only: str = "") -> li
     if rivals:
         facts += [rooms_of(kept), f"{max(r['count'] for r in kept['rows'])} {COUNTED.get(program, 'pairs')}"]
     return [*lines, "", f"{', '.join(facts)}."]
+
+
+def over_groups(kept: dict[str, Any], shown: Sequence[str], over: str) -> list[str]:
+    """A line a method, a column a figure; in a cell its values in the groups `over 1`, `over 2`, and so on."""
+    head, lines = [f"after 1, 2, … {over}"], dict[str, list[str]]()
+    for figure in shown:
+        rows = [r for r in kept["rows"] if (r["name"], r["column"]) == FIGURES[figure]]
+        rows = sorted(
+            (r for r in rows if r["group"].startswith(f"{over} ")), key=lambda r: int(r["group"].split()[1])
+        )
+        head.append(f"{figure} [{rows[0]['unit']}]")
+        for method in dict.fromkeys(r["method"] for r in rows):
+            values = [number(r["value"]) for r in rows if r["method"] == method]
+            lines.setdefault(method, [method]).append(" / ".join(values))
+    facts = f"`{kept['command']}`, {kept['date'][:10]}, {rooms_of(kept)}, {kept['rows'][0]['count']} objects."
+    return [row_of(head), row_of(["---"] * len(head)), *map(row_of, lines.values()), "", facts]
 
 
 def rooms_of(kept: dict[str, Any]) -> str:

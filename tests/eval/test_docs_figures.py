@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from eval.docs_chart import CHART, REGISTRATION_CHART, RUNS, bars_of, draw, plain, shares_of, shown_in
-from eval.docs_figures import BLOCK, FIGURES, commands_of, general, kept_of, main, with_tables
+from eval.docs_figures import BLOCK, FIGURES, commands_of, general, kept_of, main, over_groups, with_tables
 
 DOCS = Path(__file__).parents[2] / "docs"
 
@@ -75,6 +75,20 @@ def test_one_run_of_many_methods_has_a_line_a_method(docs):
     assert "| RANSAC | 75.0 (74.0 to 76.0) |  |" in made and "| GICP | 70.0" in made
     ours = with_tables(ONE.replace("median RE", "median RE; lines = methods; only = ours"), docs / "figures")
     assert "| ours, robust | **80.0**" in ours and "GICP" not in ours
+
+
+def test_figures_over_scans_stand_in_one_cell():
+    rows = [
+        row("coverage", "", m, v + n, group=f"scans {n}")
+        for n in (2, 10, 1)
+        for m, v in (("ours", 50.0), ("paper", 40.0))
+    ]
+    rows.append(row("coverage", "", "ours", 99.0))
+    kept = kept_of(RESULTS | {"command": "python -m eval.accumulation --data rooms", "rows": rows})
+    lines = over_groups(kept, ["coverage"], "scans")
+    assert lines[0] == "| after 1, 2, … scans | coverage [%] |"
+    assert lines[2:4] == ["| ours | 51.0 / 52.0 / 60.0 |", "| paper | 41.0 / 42.0 / 50.0 |"]
+    assert lines[-1].endswith("2 rooms, 8 objects.")
 
 
 def test_a_single_method_has_no_best_and_a_table_says_what_it_counts(docs):
