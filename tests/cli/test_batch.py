@@ -216,6 +216,7 @@ def test_a_file_that_is_no_manifest_is_one_line(place, capsys, text, says):
     )
 
 
+@pytest.mark.slow
 def test_parquet_in_and_out(place, tiny, inline, monkeypatch):
     monkeypatch.undo()
     arrow = pytest.importorskip("pyarrow")

@@ -182,6 +182,7 @@ def test_gradients_are_finite_with_few_points_and_one_normal(prior, cloud):
     assert np.abs(gradient[0]["decoder"]["surface"]["log_bandwidth"]).min() > 0
 
 
+@pytest.mark.slow
 def test_a_decoder_that_begins_to_see_the_surface_says_what_it_said(cloud, tmp_path):
     own = random_prior(model(surface_points=0, normals=False))
     save_prior(own, tmp_path / "plain.npz", half=False)

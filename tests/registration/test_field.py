@@ -164,6 +164,7 @@ def test_scenes_of_like_size_share_one_program(prior, clouds):
     assert programs[0] >= 1 and programs[0] == programs[1]
 
 
+@pytest.mark.slow
 def test_an_offset_is_the_field_over_its_slope(prior, clouds):
     """In float64: in float32 rounding moves points across kinks of ReLUs, where the slope jumps."""
     code = encode(prior, pad_clouds(clouds[:1], POINTS))

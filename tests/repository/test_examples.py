@@ -68,6 +68,7 @@ def test_the_short_scene_has_at_most_15_lines_of_code():
     assert len([line for line in code.splitlines() if line.strip()]) <= 15
 
 
+@pytest.mark.slow
 def test_a_chair_is_found_again(printed):
     text = printed(1)
     assert number_after("rotation error:", text) < 2

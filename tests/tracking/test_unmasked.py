@@ -7,9 +7,10 @@ import dataclasses
 import numpy as np
 import pytest
 from furnished import sheet
-from small_scenes import CONFIG, scan
+from small_scenes import CONFIG, piece, scan
 
 from more2_jax.scene import add_scan, start_scene
+from more2_jax.tracking import unmasked
 from more2_jax.tracking.objects import points_of
 from more2_jax.tracking.room_points import remembered
 from more2_jax.tracking.unmasked import things
@@ -103,3 +104,11 @@ def test_things_are_neither_floor_nor_what_lies_beside_a_mask():
     left = np.concatenate([s.background, s.instances[0].points + [0, 0, 0.02]])
     assert len(things(left, [i.points for i in s.instances])) == 1
     assert things(s.background[:100], []) == []
+
+
+def test_of_a_large_background_some_points_are_looked_at(monkeypatch):
+    s = overlooked(room("a", {0: HERE, 1: (0.3, 3.5)}, 0), 0)
+    whole, masks = len(piece(0)), [i.points for i in s.instances]
+    assert sum(len(t.points) for t in things(s.background, masks)) > 0.9 * whole
+    monkeypatch.setattr(unmasked, "MOST_POINTS", len(s.background) - 1)
+    assert 0.3 * whole < sum(len(t.points) for t in things(s.background, masks)) <= 0.5 * whole

@@ -57,6 +57,7 @@ def sample(tmp_path_factory, training):
     return shapes, draw(jax.random.key(0), shapes, jnp.arange(2), known, points=64)
 
 
+@pytest.mark.slow
 def test_a_decoder_that_begins_to_see_normals_says_what_it_said(prior, seeing, sample):
     check_shapes(seeing, "widened")
     one = jax.tree.map(lambda x: x[0, 0], sample[1])

@@ -141,6 +141,7 @@ def test_points_of_a_scan_get_no_further_flaws():
         assert least <= off < most
 
 
+@pytest.mark.slow
 def test_clouds_without_these_flaws_are_as_they_were_and_with_them_are_not():
     """Keys of their own: what else is drawn of a cloud stays."""
     seen = views()

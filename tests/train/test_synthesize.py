@@ -224,6 +224,7 @@ def command(source, capsys):
     return started
 
 
+@pytest.mark.slow
 def test_any_number_of_workers_gives_the_same_and_a_stopped_run_resumes(command, tmp_path):
     assert command(tmp_path / "one", "--workers", "1")[0] == 0
     index = json.loads((tmp_path / "one" / "index.json").read_text())

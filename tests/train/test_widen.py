@@ -87,7 +87,8 @@ def outputs(prior: Prior, points: jax.Array, mask: jax.Array, queries: jax.Array
     return {"inv": codes.inv, "eqv": codes.eqv, "scale": codes.scale, "center": codes.center, "sdf": sdf}
 
 
-@pytest.mark.parametrize("wider", [pytest.param(w, marks=[pytest.mark.slow] * (w == "all")) for w in WIDER])
+@pytest.mark.slow
+@pytest.mark.parametrize("wider", WIDER)
 def test_codes_and_distances_stay(wider):
     narrow = narrow_prior()
     wide = widen(narrow, WIDER[wider], jax.random.key(2))
