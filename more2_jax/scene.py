@@ -43,6 +43,7 @@ from more2_jax.tracking.scan_record import record
 from more2_jax.tracking.split_masks import mend_splits
 from more2_jax.tracking.surroundings import surroundings, surroundings_of_objects
 from more2_jax.tracking.unmasked import add_unmasked, not_sought, without_unfound
+from more2_jax.tracking.unseen_wholes import join_smooth
 from more2_jax.types import (
     Embedding,
     Instance,
@@ -139,6 +140,7 @@ def mends_of_masks(scene: LivingScene, scan: Scan) -> Iterator[Mend]:
     yield join_parts
     yield divided
     yield lambda masks, compared: divided(masks, compared) if masks.divided else None
+    yield join_smooth
     yield partial(add_unmasked, scans=scene.scans, scan=scan)
     yield from repeat(without_unfound)
 

@@ -23,11 +23,10 @@ if TYPE_CHECKING:
 else:
     AnyArray = Array | np.ndarray
 
-# How a quantity of a record changes when the record is moved by T = (R, t) or rescaled by s (`geometry.transform`):
-# "position" s·x, R x + t · "offset" (between positions) s·x, R x · "direction" x, R x · "columns" (directions in
-# columns) x, R x · "length" s·x, x · "pose" (between the record's frames) rescaled only · "covariance" (of shift and
-# turn) rescaled only · "axis-aligned" s·x, cannot be turned · "origin" of the record's positions · "record" as its own
-# quantities do · "invariant" neither.
+# How a quantity changes when its record is moved by T = (R, t) or rescaled by s (`geometry.transform`): "position" s·x,
+# R x + t · "offset" (between positions) s·x, R x · "direction" x, R x · "columns" (directions in columns) x, R x ·
+# "length" s·x, x · "pose" (between frames) and "covariance" (of shift and turn) rescaled only · "axis-aligned" s·x,
+# cannot be turned · "origin" of positions · "record" as its own quantities do · "invariant" neither.
 Quantity = Literal[
     "position",
     "offset",
@@ -360,13 +359,13 @@ class Repair:
     instances: tuple[int, ...] = ()  # of the scan, that are parts of it, the one that was matched first
     absorbed: tuple[str, ...] = ()  # ids that parts of it had in the scene before
     divided: str | None = None  # id of the other object that one mask, `instances`, held
-    # Points of one mask (of an earlier scan's without `instances`) that are floor or wall, or the neighbor's.
-    dropped: int = 0
+    dropped: int = 0  # points of one mask (without `instances`: of an earlier scan) that are not its object's
     neighbor: str | None = None  # id of the object that they are of
     regained: int = 0  # points beside a mask that are the object's
     unmasked: int = 0  # points of the object where no mask shows it, found as a new one of `instances`
     points: int = 0  # of the mask, before
     share: float = 1.0  # of the part, that lies on the whole; of points dropped or regained: beyond doubt
+    smooth: float = 0.0  # share of the border between parts, where no other scan shows the whole
 
 
 @dataclass(frozen=True, kw_only=True)

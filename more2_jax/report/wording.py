@@ -133,6 +133,8 @@ def repair_text(scan: ScanRecord, repair: Repair) -> str:
     if repair.dropped or repair.regained:
         return f"{scan.name}: {_border_text(repair)} ({repair.share:.0%} within half the tolerance)"
     sure = f"in parts ({repair.share:.0%} on it)"
+    if repair.smooth:
+        sure = f"in parts that go on in one another ({repair.smooth:.0%} of their border is smooth)"
     if repair.absorbed:
         return (
             f"{scan.name}: {_listed(repair.absorbed)} of the scan before and {repair.object} are one, {sure}"

@@ -70,6 +70,7 @@ def _repair_to_json(r: Repair) -> dict[str, Any]:
     lists = {"instances": [int(i) for i in r.instances], "absorbed": list(r.absorbed)}
     others = {k: getattr(r, k) for k in ("divided", "dropped", "neighbor", "regained", "unmasked", "points")}
     told = {k: v for k, v in others.items() if v}  # older readers know no others
+    told |= {"smooth": float(r.smooth)} if r.smooth else {}
     return {"object": r.object, **lists, **told, "share": float(r.share)}
 
 

@@ -46,6 +46,7 @@ class Join:
     part: int
     share: float  # of the part, on that partner
     odds: float  # of both together with it
+    smooth: float = 0.0  # share of their border, where no partner shows the whole
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -169,11 +170,16 @@ def touch(one: Points, other: Points) -> bool:
     one, other = np.unique(one, axis=0), np.unique(other, axis=0)  # points given twice lie no nearer
     if min(len(one), len(other)) < 2:
         return False  # without a distance between neighbors
-    tree, there = KDTree(one), KDTree(other)
-    spacing = np.median(np.concatenate([t.query(t.data, k=2)[0][:, 1] for t in (tree, there)]))
-    near = [t.query(p, distance_upper_bound=TOUCHING * spacing)[0] for t, p in ((tree, other), (there, one))]
+    reach = TOUCHING * spacing_of_two(one, other)
+    near = [KDTree(a).query(b, distance_upper_bound=reach)[0] for a, b in ((one, other), (other, one))]
     across = min(len(one), len(other)) ** 0.5
     return sum(int(np.isfinite(d).sum()) for d in near) >= LEAST_TOUCHING * across
+
+
+def spacing_of_two(one: Points, other: Points) -> float:
+    """Median distance between neighboring points of two clouds, meters."""
+    distances = [KDTree(p).query(p, k=2)[0][:, 1] for p in (one, other)]
+    return float(np.median(np.concatenate(distances)))
 
 
 def each_once(found: Sequence[Join]) -> list[Join]:
@@ -194,7 +200,9 @@ def with_objects_joined(whole: Regrouped, joins: Sequence[Join], prior: Prior) -
         if len(objects[first].observations) == 1 and len(objects[second].points) > len(objects[first].points):
             first, second = second, first
         objects[first] = absorbed(objects[first], objects[second])
-        repairs.append(Repair(object=objects[first].id, absorbed=(objects[second].id,), share=j.share))
+        repairs.append(
+            Repair(object=objects[first].id, absorbed=(objects[second].id,), share=j.share, smooth=j.smooth)
+        )
         parts.add(second)
         wholes.append(first)
     objects = embed_accumulated(prior, objects, wholes)
@@ -209,7 +217,8 @@ def with_instances_joined(whole: Regrouped, joins: Sequence[Join], prior: Prior)
     masks = list(whole.joined)
     for j in joins:
         first, second = sorted((j.matched, j.part), key=lambda i: -len(instances[i].points))
-        masks.append(JoinedMask(instances=(instances[first].id, instances[second].id), share=j.share))
+        ids = instances[first].id, instances[second].id
+        masks.append(JoinedMask(instances=ids, share=j.share, smooth=j.smooth))
         instances[first] = joined(instances[first], [instances[second]])
         (embeddings[first],) = embed(prior, [instances[first].points], [instances[first].normals])
         parts.add(second)

@@ -15,6 +15,7 @@ class JoinedMask:
 
     instances: tuple[int, ...]  # ids; the first is that of the whole
     share: float  # of the part's points that lie on the object
+    smooth: float = 0.0  # share of the border between parts, where no other scan shows the whole
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,7 +41,7 @@ class Regrouped:
         by_id = {self.instances[i].id: name for i, name in reversed(names.items())}
         return (
             *(
-                Repair(object=by_id[j.instances[0]], instances=j.instances, share=j.share)
+                Repair(object=by_id[j.instances[0]], instances=j.instances, share=j.share, smooth=j.smooth)
                 for j in self.joined
                 if j.instances[0] in by_id
             ),

@@ -374,6 +374,7 @@ def test_mended_masks_are_listed():
         Repair(object="object_001", instances=(3,), regained=1200, points=3000, share=0.75),
         Repair(object="object_004", instances=(9,), unmasked=800),
         Repair(object="object_005", unmasked=70),
+        Repair(object="object_006", instances=(1, 2), smooth=0.8),
     )
     mended = dataclasses.replace(SCENE.scans[-1], repairs=repairs)
     text = report_html(dataclasses.replace(SCENE, scans=(*SCENE.scans[:-1], mended)), CONFIG)
@@ -389,4 +390,5 @@ def test_mended_masks_are_listed():
     assert "1200 points beside the 3000 of object_001 (instance 3) are part of it, and taken in (75%" in text
     assert "friday: 800 points without a mask are object_004, as instance 9" in text
     assert "friday: 70 points without a mask are object_005, in the scan before" in text
+    assert "instances 1 and 2 are object_006, in parts that go on in one another (80% of their" in text
     assert "Masks are as they were given." in report_html(SCENE, CONFIG)

@@ -132,6 +132,7 @@ def test_folder_satisfies_the_schema(tmp_path):
         Repair(object="object_001", dropped=4, neighbor="object_002", points=90, share=0.75),
         Repair(object="object_001", instances=(3,), regained=12, points=90, share=0.75),
         Repair(object="object_001", instances=(9,), unmasked=700),
+        Repair(object="object_001", instances=(3, 5), smooth=0.75),
     ],
 )
 def test_what_was_mended_comes_back_and_only_what_is_said_of_it_is_written(tmp_path, repair):
@@ -144,7 +145,9 @@ def test_what_was_mended_comes_back_and_only_what_is_said_of_it_is_written(tmp_p
     jsonschema.validate(content, schema)
     (written,) = content["scans"][2]["repairs"]
     said = {
-        k for k in ("divided", "dropped", "neighbor", "regained", "unmasked", "points") if getattr(repair, k)
+        k
+        for k in ("divided", "dropped", "neighbor", "regained", "unmasked", "smooth", "points")
+        if getattr(repair, k)
     }
     assert set(written) == {"object", "instances", "absorbed", "share", *said}
 
