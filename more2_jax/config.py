@@ -150,7 +150,7 @@ class SurfaceRegistration:
     # Refined poses of different rotations among which the prior chooses, beside "it did not move".
     choose_among: int = 3
     field_points: int = 1024  # Points of each cloud whose distance to the other's completed surface counts.
-    polish_points: int = 512  # Points that are compared in the last alignment, of the best pose.
+    polish_points: int = 1024  # Points that are compared in the last alignment, of the best pose.
     polish_steps: int = 10  # Steps of that last alignment.
     polish_reach: float = 0.02  # Reach of a correspondence in its last step.
     trim: float = 0.7  # This share of the nearest distances counts in the residual.
