@@ -213,7 +213,7 @@ def with_objects_joined(whole: Regrouped, joins: Sequence[Join], prior: Prior) -
 
 def with_instances_joined(whole: Regrouped, joins: Sequence[Join], prior: Prior) -> Regrouped:
     """The larger of two instances keeps its id."""
-    instances, embeddings, parts = list(whole.instances), list(whole.embeddings), set[int]()
+    instances, embeddings, whole_of = list(whole.instances), list(whole.embeddings), dict[int, int]()
     masks = list(whole.joined)
     for j in joins:
         first, second = sorted((j.matched, j.part), key=lambda i: -len(instances[i].points))
@@ -221,11 +221,14 @@ def with_instances_joined(whole: Regrouped, joins: Sequence[Join], prior: Prior)
         masks.append(JoinedMask(instances=ids, share=j.share, smooth=j.smooth))
         instances[first] = joined(instances[first], [instances[second]])
         (embeddings[first],) = embed(prior, [instances[first].points], [instances[first].normals])
-        parts.add(second)
-    kept = [i for i in range(len(instances)) if i not in parts]
+        whole_of[second] = first
+    kept = [i for i in range(len(instances)) if i not in whole_of]
+    row = {i: n for n, i in enumerate(kept)}
+    halves = [tuple(row[whole_of.get(i, i)] for i in pair) for pair in whole.halves]
     return dataclasses.replace(
         whole,
         instances=[instances[i] for i in kept],
         embeddings=[embeddings[i] for i in kept],
+        halves=tuple((a, b) for a, b in halves if a != b),
         joined=tuple(masks),
     )

@@ -42,20 +42,30 @@ def join_smooth(whole: Regrouped, compared: Comparison) -> Regrouped | None:
     once = [k for k in compared.identified.gone if len(whole.objects[k].observations) == 1]
     scan = max((whole.objects[k].observations[0].scan for k in once), default=0)
     gone = [k for k in once if whole.objects[k].observations[0].scan == scan]
-    of_objects = smooth_joins(gone, [o.points for o in compared.old])
-    of_instances = smooth_joins(list(compared.identified.new), [o.points for o in compared.new])
+    row = {o.id: k for k, o in enumerate(whole.objects)}
+    halves = [(r.object, r.divided or "") for r in whole.repairs]
+    divided = [(row[a], row[b]) for a, b in halves if a in row and b in row]
+    of_objects = smooth_joins(gone, [o.points for o in compared.old], divided)
+    of_instances = smooth_joins(list(compared.identified.new), [o.points for o in compared.new], whole.halves)
     if not of_objects and not of_instances:
         return None
     joined = with_objects_joined(whole, of_objects, compared.prior)
     return with_instances_joined(joined, of_instances, compared.prior)
 
 
-def smooth_joins(rows: Sequence[int], clouds: Sequence[Points]) -> list[Join]:
-    """Which of the clouds of one scan, by rows, go on in one another; the smoothest first, every cloud once."""
+def smooth_joins(
+    rows: Sequence[int], clouds: Sequence[Points], apart: Sequence[tuple[int, int]] = ()
+) -> list[Join]:
+    """Which of the clouds of one scan, by rows, go on in one another; the smoothest first, every cloud once.
+
+    Not those that are known to be `apart`: halves of a mask that was divided.
+    """
     rows, found = sorted(rows), list[Join]()
     balls = Balls.around([clouds[row] for row in rows])
     for n, m in combinations(range(len(rows)), 2):
-        if m in balls.reach(clouds[rows[n]]) and touch(clouds[rows[n]], clouds[rows[m]]):
+        known_apart = {rows[n], rows[m]} in [set(pair) for pair in apart]
+        near = not known_apart and m in balls.reach(clouds[rows[n]])
+        if near and touch(clouds[rows[n]], clouds[rows[m]]):
             share = smooth_share(clouds[rows[n]], clouds[rows[m]])
             if share >= LEAST_SMOOTH:
                 found.append(Join(matched=rows[n], part=rows[m], share=1.0, odds=0.0, smooth=share))

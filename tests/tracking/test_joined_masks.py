@@ -173,6 +173,11 @@ def test_the_larger_mask_keeps_its_id_and_no_point_is_lost(tiny_prior, sizes, ke
     assert after.joined == (JoinedMask(instances=(10 + kept, 10 + gone), share=0.9),)
     assert len(after.embeddings) == 2 and after.embeddings[0] is not after.embeddings[1]
 
+    halves = ((0, 1), (kept, gone))  # of masks that were divided before: the second are one again
+    after = with_instances_joined(dataclasses.replace(before, halves=halves), JOINS, tiny_prior)
+    (pair,) = after.halves
+    assert [after.instances[i].id for i in pair] == [10 + kept, 11]
+
     after = with_objects_joined(before, JOINS, tiny_prior)
     assert [o.id for o in after.objects] == [o.id for k, o in enumerate(before.objects) if k != gone]
     (repair,) = after.repairs

@@ -43,6 +43,7 @@ def test_what_does_not_touch_or_is_too_small_to_tell_stays_apart():
     assert smooth_joins([0, 1], [HALVES[0], HALVES[1] + [0.2, 0, 0]]) == []
     assert smooth_joins([0, 1], [HALVES[0][:1], HALVES[1][:1]]) == []
     assert smooth_joins([0], [TABLE]) == []
+    assert smooth_joins([0, 1], HALVES, [(1, 0)]) == []  # one mask that was divided
 
 
 @pytest.mark.parametrize("split_scan", [0, 1])
