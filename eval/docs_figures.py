@@ -205,18 +205,18 @@ def of_methods(kept: dict[str, Any], shown: Sequence[str], only: str = "") -> li
 
 def over_groups(kept: dict[str, Any], shown: Sequence[str], over: str) -> list[str]:
     """A line a method, a column a figure; in a cell its values in the groups `over 1`, `over 2`, and so on."""
-    head, lines = [f"after 1, 2, … {over}"], dict[str, list[str]]()
-    for figure in shown:
-        rows = [r for r in kept["rows"] if (r["name"], r["column"]) == FIGURES[figure]]
-        rows = sorted(
-            (r for r in rows if r["group"].startswith(f"{over} ")), key=lambda r: int(r["group"].split()[1])
-        )
-        head.append(f"{figure} [{rows[0]['unit']}]")
-        for method in dict.fromkeys(r["method"] for r in rows):
-            values = [number(r["value"]) for r in rows if r["method"] == method]
-            lines.setdefault(method, [method]).append(" / ".join(values))
+    rows = {(r["method"], r["name"], r["column"], r.get("group")): r for r in kept["rows"]}
+    groups = {g for *_, g in rows if g and g.startswith(f"{over} ")}
+    groups = sorted(groups, key=lambda g: int(g.split()[1]))
+    lines = []
+    for method in dict.fromkeys(m for m, *_ in rows):
+        found = [[rows.get((method, *FIGURES[f], g)) for g in groups] for f in shown]
+        cells = (" / ".join(number(r["value"]) if r else "–" for r in of_figure) for of_figure in found)
+        lines.append(row_of([method, *cells]))
+    units = [next(r["unit"] for r in kept["rows"] if (r["name"], r["column"]) == FIGURES[f]) for f in shown]
+    head = [f"after 1, 2, … {over}", *(f"{f} [{unit}]" for f, unit in zip(shown, units, strict=True))]
     facts = f"`{kept['command']}`, {kept['date'][:10]}, {rooms_of(kept)}, {kept['rows'][0]['count']} objects."
-    return [row_of(head), row_of(["---"] * len(head)), *map(row_of, lines.values()), "", facts]
+    return [row_of(head), row_of(["---"] * len(head)), *lines, "", facts]
 
 
 def rooms_of(kept: dict[str, Any]) -> str:

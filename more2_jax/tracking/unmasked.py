@@ -28,6 +28,7 @@ from more2_jax.types import Embedding, Instance, ObservedObject, Scan, ScanRecor
 
 # Chosen on rooms of regime `real` with missed masks, docs/developing/notebook/mask_missed.md.
 MOST_POINTS = 300_000  # of a background that are looked at: some two centimeters apart in a room
+MASK_POINTS = 5_000  # of a mask that tell what lies beside it
 BESIDE_M = 0.05  # of a mask: what it left of its own object
 PROMISING = 3.0  # log odds below an even chance: a cluster that also holds something else
 REACH = 0.6  # shares of the missing object's radius: what lies farther from it is something else
@@ -137,7 +138,8 @@ def things(background: Points, masks: Sequence[Points]) -> list[Thing]:
     background = background[:: -(-len(background) // MOST_POINTS)]
     off = np.full(len(background), np.inf)
     if masks:
-        off = KDTree(np.concatenate(masks)).query(background, distance_upper_bound=REST_M)[0]
+        few = [m[:: -(-len(m) // MASK_POINTS)] for m in masks if len(m)]
+        off = KDTree(np.concatenate(few)).query(background, distance_upper_bound=REST_M)[0]
     free, off = background[off > BESIDE_M], off[off > BESIDE_M]
     cluster = segment_geometric(free, SegmentationConfig()).instance
     every = (cluster == k for k in range(1, 1 + cluster.max(initial=0)))

@@ -84,10 +84,12 @@ def test_figures_over_scans_stand_in_one_cell():
         for m, v in (("ours", 50.0), ("paper", 40.0))
     ]
     rows.append(row("coverage", "", "ours", 99.0))
+    rows += [row("MedRE, strict", "", "ours", 1.0 * n, group=f"scans {n}") for n in (10, 2)]
     kept = kept_of(RESULTS | {"command": "python -m eval.accumulation --data rooms", "rows": rows})
-    lines = over_groups(kept, ["coverage"], "scans")
-    assert lines[0] == "| after 1, 2, … scans | coverage [%] |"
-    assert lines[2:4] == ["| ours | 51.0 / 52.0 / 60.0 |", "| paper | 41.0 / 42.0 / 50.0 |"]
+    lines = over_groups(kept, ["coverage", "median RE of objects"], "scans")
+    assert lines[0] == "| after 1, 2, … scans | coverage [%] | median RE of objects [%] |"
+    assert lines[2] == "| ours | 51.0 / 52.0 / 60.0 | – / 2.00 / 10.0 |"
+    assert lines[3] == "| paper | 41.0 / 42.0 / 50.0 | – / – / – |"
     assert lines[-1].endswith("2 rooms, 8 objects.")
 
 
