@@ -140,7 +140,7 @@ def mends_of_masks(scene: LivingScene, scan: Scan) -> Iterator[Mend]:
     yield join_parts
     yield divided
     yield lambda masks, compared: divided(masks, compared) if masks.divided else None
-    yield join_smooth
+    yield partial(join_smooth, scans=scene.scans, scan=scan)
     yield partial(add_unmasked, scans=scene.scans, scan=scan)
     yield from repeat(without_unfound)
 

@@ -7,13 +7,14 @@ masks, and where one thing stands on another there is a crease.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import partial
 from itertools import combinations
 
 import numpy as np
 from scipy.spatial import KDTree
 
-from more2_jax.geometry.poses import Points
+from more2_jax.geometry.poses import Points, apply_pose
 from more2_jax.geometry.room_planes import across
 from more2_jax.tracking.comparison import Comparison
 from more2_jax.tracking.joined_masks import (
@@ -25,8 +26,10 @@ from more2_jax.tracking.joined_masks import (
     with_instances_joined,
     with_objects_joined,
 )
+from more2_jax.tracking.looked_at import LEAST_BACKGROUND, cannot_tell, clouds_of, spacing_of
 from more2_jax.tracking.regrouped import Regrouped
 from more2_jax.tracking.split_masks import Balls
+from more2_jax.types import Scan, ScanRecord, SceneObject
 
 # Chosen on rooms of regime `real`, docs/developing/notebook/mask_parts.md.
 SMOOTH = float(np.cos(np.deg2rad(30)))  # between normals of neighbors across a border
@@ -34,23 +37,71 @@ LEAST_SMOOTH = 0.7  # share of the border that must be smooth
 FEWEST = 5  # points of a border
 
 
-def join_smooth(whole: Regrouped, compared: Comparison) -> Regrouped | None:
-    """Joins what is left over, of either scan, where it goes on smoothly; None of none.
+def join_smooth(
+    whole: Regrouped, compared: Comparison, scans: Sequence[ScanRecord], scan: Scan
+) -> Regrouped | None:
+    """Joins what came or went in parts that go on in one another; None of none. `scans`: those before.
 
+    Only where the other scan looked: what merely nobody saw before may be two things side by side, such as cabinets.
     Objects only where they were seen once, in the same scan: two parts of one mask.
     """
-    once = [k for k in compared.identified.gone if len(whole.objects[k].observations) == 1]
-    scan = max((whole.objects[k].observations[0].scan for k in once), default=0)
-    gone = [k for k in once if whole.objects[k].observations[0].scan == scan]
-    row = {o.id: k for k, o in enumerate(whole.objects)}
-    halves = [(r.object, r.divided or "") for r in whole.repairs]
-    divided = [(row[a], row[b]) for a, b in halves if a in row and b in row]
-    of_objects = smooth_joins(gone, [o.points for o in compared.old], divided)
-    of_instances = smooth_joins(list(compared.identified.new), [o.points for o in compared.new], whole.halves)
+    frame = compared.identified.frame
+    if frame.unknown or scans[-1].frame.unknown:
+        return None
+    gone, new = rows_of_once(whole.objects, compared.identified.gone), list(compared.identified.new)
+    of_objects = smooth_joins(gone, [o.points for o in compared.old], divided(whole))
+    of_instances = smooth_joins(new, [o.points for o in compared.new], whole.halves)
+    now, before = (scan.background, *(i.points for i in whole.instances)), partial(clouds_of, whole.objects)
+    of_objects = looked_for(
+        of_objects,
+        [o.points for o in compared.old],
+        lambda: (apply_pose(frame.T_scene_scan, points) for points in now),
+        compared,
+    )
+    of_instances = looked_for(
+        of_instances,
+        [apply_pose(frame.T_scene_scan, o.points) for o in compared.new],
+        lambda: before(scans[-1]),
+        compared,
+    )
     if not of_objects and not of_instances:
         return None
     joined = with_objects_joined(whole, of_objects, compared.prior)
     return with_instances_joined(joined, of_instances, compared.prior)
+
+
+def rows_of_once(objects: Sequence[SceneObject], rows: Iterable[int]) -> list[int]:
+    """Those of the rows whose objects were seen once, by the latest scan that saw such a one."""
+    seen = {k: objects[k].observations[0].scan for k in rows if len(objects[k].observations) == 1}
+    return [k for k, scan in seen.items() if scan == max(seen.values())]
+
+
+def divided(whole: Regrouped) -> list[tuple[int, int]]:
+    """Objects, by rows, that are halves of one mask."""
+    row = {o.id: k for k, o in enumerate(whole.objects)}
+    halves = [(r.object, r.divided or "") for r in whole.repairs]
+    return [(row[a], row[b]) for a, b in halves if a in row and b in row]
+
+
+def looked_for(
+    joins: Sequence[Join],
+    places: Sequence[Points],
+    clouds: Callable[[], Iterator[Points]],
+    compared: Comparison,
+) -> list[Join]:
+    """Those joins of which the other scan can tell that it lacks both clouds.
+
+    `places`: the clouds by rows. `clouds`: what the other scan shows, its background first. All in the scene's frame.
+    """
+    if not joins:
+        return []
+    background = next(clouds())
+    if len(background) < LEAST_BACKGROUND:
+        return list(joins)
+    rows = [row for j in joins for row in (j.matched, j.part)]
+    upright = compared.config.motion == "upright"
+    unsure = cannot_tell([places[row] for row in rows], clouds, upright, spacing_of(background))
+    return [j for j, a, b in zip(joins, unsure[::2], unsure[1::2], strict=True) if not a and not b]
 
 
 def smooth_joins(

@@ -7,6 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 from boxes import box
+from furnished import sheet
 from small_scenes import CONFIG, scan
 
 from more2_jax.scene import add_scan, start_scene
@@ -44,6 +45,26 @@ def test_what_does_not_touch_or_is_too_small_to_tell_stays_apart():
     assert smooth_joins([0, 1], [HALVES[0][:1], HALVES[1][:1]]) == []
     assert smooth_joins([0], [TABLE]) == []
     assert smooth_joins([0, 1], HALVES, [(1, 0)]) == []  # one mask that was divided
+
+
+@pytest.mark.parametrize("looked", [True, False])
+def test_what_nobody_looked_for_before_stays_in_the_masks_that_it_has(tiny_prior, looked):
+    """It may be two things side by side that a scan saw first."""
+    halves = [Instance(id=50 + n, points=h) for n, h in enumerate(HALVES)]
+    own = scan("b", {1: (0.3, 3.5)})
+    visits = [
+        dataclasses.replace(own, name="a", background=floor([-2.0 if looked else 2.0, -2.0, -0.6], 0)),
+        dataclasses.replace(
+            own, instances=(*own.instances, *halves), background=floor([-2.0, -2.0, -0.6], 1)
+        ),
+    ]
+    made = add_scan(tiny_prior, start_scene(tiny_prior, visits[0], CONFIG), visits[1], CONFIG)
+    (change,) = made.changes
+    assert [len(change.added), len(change.discovered)] == ([1, 0] if looked else [0, 2])
+
+
+def floor(corner: list[float], seed: int) -> np.ndarray:
+    return sheet(corner, [7.0, 0, 0], [0, 5.0, 0], np.random.default_rng(seed))
 
 
 @pytest.mark.parametrize("split_scan", [0, 1])
