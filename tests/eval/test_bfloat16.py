@@ -58,6 +58,7 @@ def test_nothing_is_rounded_afterwards(tiny_prior, batch, exact):
         np.testing.assert_array_equal(again[name], value)
 
 
+@pytest.mark.slow
 def test_figures_of_what_is_not_rounded_say_that_nothing_changed(batch, exact):
     rows = {r.name: r for r in field_rows("float32", [exact[0]], [exact[0]], batch[0], [1, 1])}
     assert rows["change of distances"].value == 0

@@ -149,6 +149,7 @@ def test_objects_of_the_demo_have_the_hosts_meshes(prior):
         assert_same(expected, found, points.mean(axis=0), 0.15, 0.03)
 
 
+@pytest.mark.slow
 def test_programs_are_as_many_as_sizes(prior, hard, made):
     """Whatever the scene: clouds of other sizes, with sensors or normals or without, with a floor or without."""
     before = batch._surfaces._cache_size()
@@ -184,6 +185,7 @@ def meshes_of(surfaces, objects):
     ]
 
 
+@pytest.mark.slow
 def test_neither_padding_nor_order_nor_company_changes_a_mesh(tiny_prior, noisy_boxes, alone):
     backward = [as_row(o, LITTLE) for o in noisy_boxes[::-1]]
     together = batch.surfaces(tiny_prior, backward, LITTLE.meshing, 4)

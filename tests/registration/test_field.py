@@ -142,6 +142,7 @@ def test_flat_straight_and_single_points_give_finite_poses(prior, clouds):
         assert bool(jnp.isfinite(result.rms_m).all()) and bool(jnp.isfinite(result.loss).all())
 
 
+@pytest.mark.slow
 def test_the_loss_returned_is_that_of_the_pose_returned(prior, clouds):
     pairs = pairs_of(prior, clouds, clouds)
     result = register(prior, pairs, FIELD, "upright")

@@ -75,6 +75,7 @@ def test_something_else_without_a_mask_stays_background(tiny_prior, scan_with_cl
     assert not change.moved and not made.scans[1].repairs
 
 
+@pytest.mark.slow
 def test_masks_are_kept_where_that_is_asked(tiny_prior):
     kept = dataclasses.replace(CONFIG, repair_masks=False)
     visits = room("a", {0: HERE, 1: (0.3, 3.5)}, 0), overlooked(room("b", {0: THERE, 1: (0.3, 3.5)}, 4), 0)

@@ -70,6 +70,7 @@ def same_files(one: Path, other: Path) -> bool:
     )
 
 
+@pytest.mark.slow
 def test_shards_resume_and_repeat(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(prepare, "SHARD", 2)
     out = tmp_path / "out"

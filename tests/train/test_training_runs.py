@@ -143,8 +143,8 @@ def test_four_devices_take_the_steps_of_one_each_doing_its_share(made):
 
 
 @pytest.mark.begins
-def test_in_short_a_run_on_two_devices_is_that_on_one_and_resumes_bit_for_bit(tmp_path):
-    """What the slow tests below try at length."""
+def test_in_short_a_run_on_two_devices_resumes_bit_for_bit(tmp_path):
+    """What the slow tests beside it try at length; that more devices make the same steps, those above."""
     (tmp_path / "settings.yaml").write_text(FEW)
     sphere_shards(tmp_path)
     killed = program(["-c", LET_BE_THEN_KILLED_AT_A_CHECKPOINT, str(tmp_path)], 2, quickly=True)
@@ -154,10 +154,8 @@ def test_in_short_a_run_on_two_devices_is_that_on_one_and_resumes_bit_for_bit(tm
     finish(started(tmp_path, "killed", devices=2, quickly=True))
     for name in ("weights.npz", "best.npz"):
         np.testing.assert_array_equal(*(weights(tmp_path / k / name) for k in ("let_be", "killed")))
-    finish(started(tmp_path, "one", quickly=True))
-    for a, b, one in zip(*logs(tmp_path, "let_be", "killed", "one"), strict=True):
+    for a, b in zip(*logs(tmp_path, "let_be", "killed"), strict=True):
         assert (a["step"], a["train"], a["val"]) == (b["step"], b["train"], b["val"])
-        assert a["step"] == one["step"] and a["train"] == pytest.approx(one["train"], rel=1e-3)
 
 
 @pytest.mark.slow
