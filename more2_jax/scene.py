@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager
 from functools import partial
 from itertools import repeat
 from typing import Any
@@ -36,7 +36,7 @@ from more2_jax.tracking.merged_masks import divide_merged
 from more2_jax.tracking.object_views import Views
 from more2_jax.tracking.objects import SCENE_FRAME, accumulated, new_objects, next_number
 from more2_jax.tracking.regrouped import Regrouped
-from more2_jax.tracking.relocalize import known_object, relocalize, with_observations
+from more2_jax.tracking.relocalize import accumulated_rows, known_object, relocalize, with_observations
 from more2_jax.tracking.room_points import Cleared, remembered, without_room
 from more2_jax.tracking.rooms import rooms_of
 from more2_jax.tracking.scan_record import record
@@ -189,9 +189,9 @@ def added(
     mended = mend_splits(whole.objects, whole.instances, pairs, seen[: len(pairs)])
     objects = with_observations(mended.objects, mended.instances, found, seen)
     objects, borders = with_borders_mended(objects, whole.masked(found), scene, level, config)
-    with stage("encode", len(found)) if config.accumulate_target else nullcontext():
-        changed = [f.object for f, s in zip(found, seen, strict=True) if s.accumulated]
-        objects = embed_accumulated(prior, objects, changed if config.accumulate_target else [])
+    if config.accumulate_target:
+        with stage("encode", len(found)):
+            objects = embed_accumulated(prior, objects, accumulated_rows(found, seen))
     missing, left = mended.left_over([(f.object, f.instance) for f in found])
     unseen = not_looked_at(objects, missing, level, frame, scene.upright)
     fresh = new_objects(next_number(objects, scene.scans), index, left, whole.instances, codes, frame)

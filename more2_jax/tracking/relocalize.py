@@ -241,3 +241,8 @@ def with_observations(
     for f, observation in zip(found, seen, strict=True):
         known[f.object] = seen_again(known[f.object], instances[f.instance], observation)
     return known
+
+
+def accumulated_rows(found: Sequence[Found], seen: Sequence[Observation]) -> list[int]:
+    """Rows of the objects whose shape an observation adds to."""
+    return [f.object for f, s in zip(found, seen, strict=True) if s.accumulated]

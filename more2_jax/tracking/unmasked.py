@@ -17,6 +17,7 @@ from scipy.spatial import KDTree
 
 from more2_jax.geometry.poses import Points, apply_pose
 from more2_jax.geometry.segmentation import SegmentationConfig, segment_geometric
+from more2_jax.geometry.voxels import LARGEST_GRID
 from more2_jax.matching.candidates import portable
 from more2_jax.network.embedding_batch import embed
 from more2_jax.network.prior import Prior
@@ -140,8 +141,10 @@ def things(background: Points, masks: Sequence[Points]) -> list[Thing]:
     if masks:
         few = [m[:: -(-len(m) // MASK_POINTS)] for m in masks if len(m)]
         off = KDTree(np.concatenate(few)).query(background, distance_upper_bound=REST_M)[0]
-    free, off = background[off > BESIDE_M], off[off > BESIDE_M]
-    cluster = segment_geometric(free, SegmentationConfig()).instance
+    free, off, config = background[off > BESIDE_M], off[off > BESIDE_M], SegmentationConfig()
+    if not len(free) or np.ptp(free, axis=0).max() > config.voxel_m * LARGEST_GRID:
+        return []  # something strays kilometers away
+    cluster = segment_geometric(free, config).instance
     every = (cluster == k for k in range(1, 1 + cluster.max(initial=0)))
     return [Thing(points=free[c], rest=bool(np.isfinite(off[c]).mean() > LEAST_REST)) for c in every]
 

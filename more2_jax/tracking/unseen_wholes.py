@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
-from itertools import combinations
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -51,7 +50,7 @@ def join_smooth(
     gone, new = rows_of_once(whole.objects, compared.identified.gone), list(compared.identified.new)
     of_objects = smooth_joins(gone, [o.points for o in compared.old], divided(whole))
     of_instances = smooth_joins(new, [o.points for o in compared.new], whole.halves)
-    now, before = (scan.background, *(i.points for i in whole.instances)), partial(clouds_of, whole.objects)
+    now = (scan.background, *(i.points for i in whole.instances))
     of_objects = looked_for(
         of_objects,
         [o.points for o in compared.old],
@@ -61,7 +60,7 @@ def join_smooth(
     of_instances = looked_for(
         of_instances,
         [apply_pose(frame.T_scene_scan, o.points) for o in compared.new],
-        lambda: before(scans[-1]),
+        partial(clouds_of, whole.objects, scans[-1]),
         compared,
     )
     if not of_objects and not of_instances:
@@ -112,14 +111,13 @@ def smooth_joins(
     Not those that are known to be `apart`: halves of a mask that was divided.
     """
     rows, found = sorted(rows), list[Join]()
-    balls = Balls.around([clouds[row] for row in rows])
-    for n, m in combinations(range(len(rows)), 2):
-        known_apart = {rows[n], rows[m]} in [set(pair) for pair in apart]
-        near = not known_apart and m in balls.reach(clouds[rows[n]])
-        if near and touch(clouds[rows[n]], clouds[rows[m]]):
-            share = smooth_share(clouds[rows[n]], clouds[rows[m]])
-            if share >= LEAST_SMOOTH:
-                found.append(Join(matched=rows[n], part=rows[m], share=1.0, odds=0.0, smooth=share))
+    balls, known_apart = Balls.around([clouds[row] for row in rows]), {frozenset(pair) for pair in apart}
+    for n, one in enumerate(rows):
+        for other in (rows[m] for m in balls.reach(clouds[one]) if m > n):
+            if {one, other} in known_apart or not touch(clouds[one], clouds[other]):
+                continue
+            if (share := smooth_share(clouds[one], clouds[other])) >= LEAST_SMOOTH:
+                found.append(Join(matched=one, part=other, share=1.0, odds=0.0, smooth=share))
     return each_once(sorted(found, key=lambda j: -j.smooth))
 
 

@@ -105,6 +105,10 @@ def test_things_are_neither_floor_nor_what_lies_beside_a_mask():
     left = np.concatenate([s.background, s.instances[0].points + [0, 0, 0.02]])
     assert len(things(left, [i.points for i in s.instances])) == 1
     assert things(s.background[:100], []) == []
+    assert (
+        things(np.concatenate([s.background, [[1e6, 0, 0]]]), []) == []
+    )  # wider than its voxels can be numbered
+    assert things(s.background, np.array_split(s.background, 20)) == []  # all of it is in masks
 
 
 def test_of_a_large_background_some_points_are_looked_at(monkeypatch):
