@@ -20,7 +20,6 @@ compile_quickly()
 gc.set_threshold(50_000, 20, 50)
 # Before anything of more2_jax is imported: every call's shapes and dtypes are held against its annotations.
 install_import_hook(checked_modules(), "beartype.beartype")
-jax.config.update("jax_default_matmul_precision", "highest")
 
 # One browser for all tests of the page; after the hook, for it imports more2_jax.
 from page_browser import browser, common, opened, opener, report, said  # noqa: E402, F401

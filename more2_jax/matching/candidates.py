@@ -23,7 +23,6 @@ from more2_jax.matching.calibration import Compared, calibrated
 from more2_jax.matching.color import color_evidence
 from more2_jax.matching.metric_evidence import (
     MetricEvidence,
-    Samples,
     Seen,
     metric_evidence,
     samples_of,
@@ -56,6 +55,16 @@ OBJECTS_AT_ONCE = 64  # padded and prepared at a time
 
 
 @dataclass(frozen=True, kw_only=True)
+class ReadySide:
+    """What one scan brings to be aligned, or the scene so far; k clouds."""
+
+    objects: Sequence[ObservedObject]
+    # What sensors saw only where a search asks. Of many objects only what a comparison needs.
+    ready: AlignableObject
+    origins: Float[np.ndarray, "k 3"]  # of their local frames
+
+
+@dataclass(frozen=True, kw_only=True)
 class AlignedPairs:
     """The pairs of objects (n) and instances (m) that were aligned, and all that is known of them; p pairs.
 
@@ -63,10 +72,7 @@ class AlignedPairs:
     """
 
     rows: Int[np.ndarray, "p 2"]  # (object, instance), by objects, then by instances
-    sides: tuple[Sequence[ObservedObject], Sequence[ObservedObject]]  # instances (m) and objects (n)
-    # Prepared; what sensors saw only where a search asks. Of many objects only what a comparison needs.
-    ready: tuple[AlignableObject, AlignableObject]
-    origins: tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "n 3"]]  # of their local frames
+    ends: tuple[ReadySide, ReadySide]  # instances (m) and objects (n)
     search: SurfaceSearch  # that they were prepared for
     stayed: jaxlie.SE3  # (p,): "it did not move", an instance's local frame to the object's
     found: FoundPoses  # (p, k), local frames: instances onto objects
@@ -78,6 +84,16 @@ class AlignedPairs:
     metric: MetricEvidence
     seen: Seen | None = None  # what both scans saw; None where that is no evidence (any orientation)
     height_m: float = 0.0  # upright: that the scan was taken to lie at
+
+    @property
+    def sides(self) -> tuple[Sequence[ObservedObject], Sequence[ObservedObject]]:
+        """The instances (m) and the objects (n)."""
+        return self.ends[0].objects, self.ends[1].objects
+
+    @property
+    def ready(self) -> tuple[AlignableObject, AlignableObject]:
+        """The same as they were prepared."""
+        return self.ends[0].ready, self.ends[1].ready
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -140,12 +156,10 @@ def align_candidates(
     T = np.eye(4) if T_scene_scan is None else T_scene_scan
     worth = proposed(old, new, matcher, T if place is None else place)
     few = max(len(old), len(new)) <= OBJECTS_AT_ONCE
-    (instances, of_new), (objects, of_old) = (prepared(x, matcher.search, motion, few) for x in (new, old))
+    instances, objects = (prepared(x, matcher.search, motion, few) for x in (new, old))
     return aligned_pairs(
         prior,
-        (new, old),
         (instances, objects),
-        (of_new, of_old),
         worth,
         (matcher.search, motion),
         T,
@@ -155,25 +169,21 @@ def align_candidates(
 
 def aligned_pairs(
     prior: Prior,
-    sides: tuple[Sequence[ObservedObject], Sequence[ObservedObject]],
-    ready: tuple[AlignableObject, AlignableObject],
-    origins: tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "n 3"]],
+    sides: tuple[ReadySide, ReadySide],
     worth: Proposed,
     how: tuple[SurfaceSearch, MotionModel],
     T_scene_scan: Pose,
     seen: Seen | None,
 ) -> AlignedPairs:
-    """The proposed pairs of instances and objects (`sides`), which are `ready`, with their local frames' origins."""
-    rows, (search, motion) = worth.pairs[:, ::-1], how
-    ends = origins[1][rows[:, 1]], origins[0][rows[:, 0]]
-    stayed = local_poses(np.broadcast_to(T_scene_scan, (len(rows), 4, 4)), *ends)
+    """The proposed pairs of instances and objects (`sides`)."""
+    rows, (search, motion), (new, old) = worth.pairs[:, ::-1], how, sides
+    ready, origins = (new.ready, old.ready), (old.origins[rows[:, 1]], new.origins[rows[:, 0]])
+    stayed = local_poses(np.broadcast_to(T_scene_scan, (len(rows), 4, 4)), *origins)
     found = search_poses(*ready, stayed, search, motion, rows)
     found, off, own = told_by_prior(prior, ready, rows, found, search, motion)
-    T_old_new = world_poses(found.poses, ends[0][:, None], ends[1][:, None])
-    samples = samples_of(ready[0], origins[0]), samples_of(ready[1], origins[1])
+    T_old_new = world_poses(found.poses, origins[0][:, None], origins[1][:, None])
     return AlignedPairs(
-        ready=ready,
-        origins=origins,
+        ends=sides,
         search=search,
         stayed=stayed,
         found=found,
@@ -181,24 +191,23 @@ def aligned_pairs(
         off=off,
         off_own=own,
         height_m=float(T_scene_scan[2, 3]),
-        **known_of(worth, sides, samples, T_old_new, seen),
+        **known_of(worth, sides, T_old_new, seen),
     )
 
 
 def known_of(
     worth: Proposed,
-    sides: tuple[Sequence[ObservedObject], Sequence[ObservedObject]],
-    samples: tuple[Samples, Samples],
+    sides: tuple[ReadySide, ReadySide],
     T_old_new: Float[np.ndarray, "p k 4 4"],
     seen: Seen | None,
 ) -> dict[str, Any]:
-    """What clouds and codes say of the proposed pairs; of instances and objects, as `metric_evidence` takes them."""
-    new, old = sides
+    """What clouds and codes say of the proposed pairs of instances and objects."""
+    new, old = (side.objects for side in sides)
+    samples = samples_of(sides[0].ready, sides[0].origins), samples_of(sides[1].ready, sides[1].origins)
     k, i = worth.pairs.T
     return {
         "rows": worth.pairs,
-        "sides": sides,
-        "metric": metric_evidence(sides, samples, worth.pairs[:, ::-1], T_old_new, seen),
+        "metric": metric_evidence((new, old), samples, worth.pairs[:, ::-1], T_old_new, seen),
         "compared": compared(old, new, worth),
         "top_gap_m": heights(old)[1][k] - heights(new)[1][i],
         "seen": seen,
@@ -226,8 +235,8 @@ def told_by_prior(
 
 def prepared(
     side: Sequence[ObservedObject], search: SurfaceSearch, motion: MotionModel, keep: bool
-) -> tuple[AlignableObject, Float[np.ndarray, "b 3"]]:
-    """The objects of one scan ready to be aligned, and the origins of their local frames.
+) -> ReadySide:
+    """The objects of one scan ready to be aligned.
 
     `OBJECTS_AT_ONCE` are padded at a time; without what sensors saw, which only a search with a `free_weight` reads.
     `keep`: with all that registration reads as well, 0.3 MB an object; else, in any orientation, half of it.
@@ -241,7 +250,8 @@ def prepared(
         if not keep:
             every = dataclasses.replace(every, whole=None) if asks_prior(search, motion) else searched(every)
         ready.append(every)
-    return jax.tree.map(lambda *x: np.concatenate(x), *ready), np.concatenate(origins)
+    every = jax.tree.map(lambda *x: np.concatenate(x), *ready)
+    return ReadySide(objects=side, ready=every, origins=np.concatenate(origins))
 
 
 def check_asked(

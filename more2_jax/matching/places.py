@@ -81,7 +81,7 @@ def with_neighbors(
     T = np.eye(4)
     T[2, 3] = aligned.height_m
     how = matcher.search, motion
-    more = aligned_pairs(prior, aligned.sides, aligned.ready, aligned.origins, worth, how, T, aligned.seen)
+    more = aligned_pairs(prior, aligned.ends, worth, how, T, aligned.seen)
     return together(aligned, more)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 from contextlib import nullcontext
-from functools import partial
+from functools import cache, partial
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -57,6 +57,7 @@ def init_prior(config: PriorConfig, key: Array, name: str = "random") -> Prior:
     return Prior(params=params, config=config, name=name)
 
 
+@cache
 def _shapes(config: PriorConfig) -> tuple[dict[str, Any], Embedding]:
     """Shapes and dtypes of all weights, and of the embedding of one cloud; computes nothing.
 

@@ -181,7 +181,7 @@ def test_in_any_orientation_the_evidence_is_that_of_the_best_pose(tiny_prior):
     np.testing.assert_allclose(found.off_own[0], max(own), atol=1e-3)
 
 
-@pytest.mark.parametrize("motion", ["free", "upright"])
+@pytest.mark.parametrize("motion", [pytest.param("free", marks=pytest.mark.slow), "upright"])
 def test_of_many_objects_less_is_kept_and_registration_is_handed_the_same(tiny_prior, monkeypatch, motion):
     rng = np.random.default_rng(3)
     sizes = ([1.0, 0.5, 0.6], [0.4, 0.5, 0.9])

@@ -69,7 +69,7 @@ def partners(result) -> list[tuple[int, int, bool]]:
     return [(f.object, f.instance, f.interchangeable) for f in result.found]
 
 
-@pytest.mark.parametrize("brightness", [1.0, 0.8])
+@pytest.mark.parametrize("brightness", [pytest.param(1.0, marks=pytest.mark.slow), 0.8])
 def test_copies_that_swap_places_are_told_by_their_color(tiny_prior, brightness):
     swapped = twins((BLUE, RED), brightness=brightness)
     assert partners(identified(tiny_prior, twins((RED, BLUE)), swapped)) == [(0, 1, False), (1, 0, False)]

@@ -21,7 +21,7 @@ POINTS, BATCH = 512, 8  # what clouds are padded to and how many there are, of c
 LEAVES = ("inv", "eqv", "scale", "center")
 
 
-@pytest.fixture(scope="module", params=["tiny", "small"])
+@pytest.fixture(scope="module", params=["tiny", pytest.param("small", marks=pytest.mark.slow)])
 def prior(request):
     config = load_config(CONFIGS / f"{request.param}.yaml", TrainingRun).model
     return init_prior(config, jax.random.key(1), request.param)

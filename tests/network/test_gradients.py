@@ -86,7 +86,13 @@ def assert_close(ours: dict, numeric: dict, tolerance: float) -> None:
 # --- derivatives by the points ----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("slope", [jax.jit(jax.jacfwd(of_shift)), slope_of_shift], ids=["jacfwd", "jacrev"])
+@pytest.mark.parametrize(
+    "slope",
+    [
+        pytest.param(jax.jit(jax.jacfwd(of_shift)), id="jacfwd", marks=pytest.mark.slow),
+        pytest.param(slope_of_shift, id="jacrev"),
+    ],
+)
 def test_both_modes_agree_with_central_differences(prior64, slope):
     at = np.zeros(3)
     assert_close(slope(at, prior64), differences(lambda x: value_of_shift(x, prior64), at), 1e-6)

@@ -7,7 +7,7 @@ from importlib.metadata import version
 
 import jax
 
-LITTLE = "jax_disable_most_optimizations"  # an option of JAX
+LITTLE, PRECISION = "jax_disable_most_optimizations", "jax_default_matmul_precision"  # options of JAX
 
 
 def compile_quickly() -> None:
@@ -21,14 +21,21 @@ def compile_quickly() -> None:
     if version("jaxlib").startswith(("0.9.", "0.10.")):
         os.environ["XLA_FLAGS"] = "--xla_cpu_use_fusion_emitters=false"
     jax.config.update(LITTLE, True)
+    jax.config.update(PRECISION, "highest")
 
 
 @contextmanager
 def optimized(much: bool = True) -> Iterator[None]:
-    """Programs compile as the commands compile them meanwhile, or not; those compiled before stay as they are."""
-    before = jax.config.values[LITTLE]
+    """Programs compile as the commands compile them meanwhile, or not.
+
+    JAX keeps a program in memory whatever was asked of the compiler, so one made with little optimization would be
+    taken again, and its last bits differ. It does tell programs apart by the precision asked for, which has two names.
+    """
+    before = {name: jax.config.values[name] for name in (LITTLE, PRECISION)}
     jax.config.update(LITTLE, not much)
+    jax.config.update(PRECISION, "float32" if much else "highest")
     try:
         yield
     finally:
-        jax.config.update(LITTLE, before)
+        for name, value in before.items():
+            jax.config.update(name, value)

@@ -209,7 +209,7 @@ def test_a_leveled_scan_turned_about_the_vertical_keeps_its_tilt():
 OPEN = dataclasses.replace(CONFIG, upright=None)
 
 
-@pytest.mark.parametrize("tilt_deg", [0.0, 5.0])
+@pytest.mark.parametrize("tilt_deg", [pytest.param(0.0, marks=pytest.mark.slow), 5.0])
 def test_where_nobody_says_a_level_floor_has_things_stay_upright(tiny_prior, tilt_deg):
     first = in_frame(A, tilt(A, tilt_deg, 20.0))
     made = add_scan(tiny_prior, start_scene(tiny_prior, first, OPEN), B, OPEN)
@@ -243,7 +243,7 @@ def bare(s: Scan) -> Scan:
     return dataclasses.replace(s, background=NOTHING)
 
 
-@pytest.mark.parametrize("tilt_deg", [0.0, 12.0])
+@pytest.mark.parametrize("tilt_deg", [pytest.param(0.0, marks=pytest.mark.slow), 12.0])
 def test_a_later_scan_without_a_floor_is_leveled_by_its_objects(tiny_prior, level_scene, tilt_deg):
     T = tilt(B, tilt_deg, 160.0)
     scene = start_scene(tiny_prior, A, OPEN)
