@@ -107,7 +107,8 @@ class EvidenceMatcher:
     candidates: int = 8  # Partners of every object, and of every instance, that are aligned. 0: all.
     # Weight in the proposal of |log F_s ratio|, beside the cosine of the F_inv.
     size_weight: float = 0.5
-    motion_weight: float = 0.2  # Log odds that each meter moved costs. It decides among identical objects.
+    # Log odds that each meter moved costs, a quarter of it in any orientation. It decides among identical objects.
+    motion_weight: float = 0.2
     # Log odds that a pair gains that fits where it would be had nothing moved: identical objects rarely change places.
     stayed_weight: float = 6.0
     # The evidence is calibrated on poses found without free space, which counts when they are refined.

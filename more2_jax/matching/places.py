@@ -24,18 +24,22 @@ from more2_jax.network.prior import Prior
 # How far what did not move may seem to have moved, and its center where it also seems to have turned.
 STAYED_M, STAYED_DEG, STAYED_TURNED_M = 0.15, 10.0, 0.06
 OTHER_COLOR = -1.0  # log likelihood ratio: what has less is of another color
+# Of what a meter costs, in any orientation: without heights right pairs are less sure of one another, and four meters
+# outvoted them (docs/developing/notebook/matching_any_orientation.md).
+FREE_SHARE = 0.25
 BY_PAIR = ("rows", "T_old_new", "top_gap_m", "off", "off_own")  # arrays of `AlignedPairs`
 BESIDE_M = 0.6  # centers of an object and of what a damaged mask shows of it, where it was
 
 
 def motion_odds(
-    aligned: AlignedPairs, T_scene_scan: Pose, matcher: EvidenceMatcher
+    aligned: AlignedPairs, T_scene_scan: Pose, matcher: EvidenceMatcher, motion: MotionModel
 ) -> Float[np.ndarray, " p"]:
     """Log odds of how every pair moved, if it is one object, the scan lying at `T_scene_scan`: few things go far."""
     k, i = aligned.rows.T
     old, new = centers(aligned, T_scene_scan)
     moved_m = np.minimum(np.linalg.norm(old[k] - new[i], axis=-1), FARTHEST_M)
-    return matcher.stayed_weight * stayed(aligned, T_scene_scan) - matcher.motion_weight * moved_m
+    a_meter = matcher.motion_weight * (1.0 if motion == "upright" else FREE_SHARE)
+    return matcher.stayed_weight * stayed(aligned, T_scene_scan) - a_meter * moved_m
 
 
 def stayed(aligned: AlignedPairs, T_scene_scan: Pose) -> Bool[np.ndarray, " p"]:

@@ -91,7 +91,7 @@ def by_evidence(
 ) -> Identified:
     """The assignment that surfaces find likeliest, with probabilities, and the frame of the scan."""
     frame, weighed = common_frame(prior, old, new, matcher, config.motion, rooms)
-    pairs = assign(weighed.odds, motion_odds(weighed.aligned, frame.T_scene_scan, matcher))
+    pairs = assign(weighed.odds, motion_odds(weighed.aligned, frame.T_scene_scan, matcher, config.motion))
     return as_told(weighed.odds, pairs, frame, weighed.aligned, config)
 
 
@@ -107,7 +107,8 @@ def with_left_over(identified: Identified, config: SceneConfig) -> Identified:
     k, i = odds.pairs.T
     rows = np.isin(k, list(identified.gone)) & np.isin(i, list(identified.new))
     left = LogOdds(pairs=odds.pairs[rows], value=odds.value[rows] + LEFT_OVER, shape=odds.shape)
-    more = assign(left, motion_odds(aligned, frame.T_scene_scan, config.matching)[rows])
+    motion = motion_odds(aligned, frame.T_scene_scan, config.matching, config.motion)
+    more = assign(left, motion[rows])
     if not len(more):
         return identified
     found = np.array([(f.object, f.instance) for f in identified.found], int).reshape(-1, 2)

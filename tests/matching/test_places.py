@@ -12,7 +12,7 @@ from more2_jax.matching.assignment import assign, interchangeable
 from more2_jax.matching.calibration import CARRIED, UPRIGHT, Compared, log_odds
 from more2_jax.matching.candidates import PORTABLE_M, align_candidates, odds_of, portable
 from more2_jax.matching.pair_evidence import PairEvidence
-from more2_jax.matching.places import BESIDE_M, OTHER_COLOR, motion_odds, stayed, with_neighbors
+from more2_jax.matching.places import BESIDE_M, FREE_SHARE, OTHER_COLOR, motion_odds, stayed, with_neighbors
 from more2_jax.network.embedding_batch import embed
 from more2_jax.types import ObservedObject
 
@@ -73,24 +73,26 @@ def test_of_copies_that_stayed_none_changes_places_though_others_fit_better(tiny
     assert (odds.value > 0).all()
     odds = dataclasses.replace(odds, value=np.array([1.0, 3.0, 3.0, 1.0]))  # as damaged masks may have it
     assert assign(odds).tolist() == [[0, 1], [1, 0]]
-    pairs = assign(odds, motion_odds(aligned, np.eye(4), MATCHER))
+    pairs = assign(odds, motion_odds(aligned, np.eye(4), MATCHER, "upright"))
     assert pairs.tolist() == [[0, 0], [1, 1]]
     assert interchangeable(odds, pairs) == [True, True]
     red_and_blue = dataclasses.replace(aligned.compared, color=np.array([OTHER_COLOR - 1, 2.0, 2.0, -2.0]))
     swapped = dataclasses.replace(aligned, compared=red_and_blue)
-    pairs = assign(odds, motion_odds(swapped, np.eye(4), MATCHER))
+    pairs = assign(odds, motion_odds(swapped, np.eye(4), MATCHER, "upright"))
     assert pairs.tolist() == [[0, 1], [1, 0]]  # where one stood, another stands now
 
 
 def test_motion_adds_nothing_to_what_went_far_but_a_bounded_cost(tiny_prior, room):
     aligned = aligned_at(tiny_prior, *room)
-    motion = motion_odds(aligned, np.eye(4), MATCHER)
+    motion = motion_odds(aligned, np.eye(4), MATCHER, "upright")
     here = np.array([tuple(r) in {(0, 0), (1, 1)} for r in aligned.rows.tolist()])
     np.testing.assert_allclose(motion[here], MATCHER.stayed_weight, atol=0.05)
     assert (motion[~here] < 0).all()
     far = np.eye(4)
     far[0, 3] = 1e4
-    assert motion_odds(aligned, far, MATCHER).min() == pytest.approx(-10 * MATCHER.motion_weight)
+    for motion, share in (("upright", 1.0), ("free", FREE_SHARE)):
+        least = motion_odds(aligned, far, MATCHER, motion).min()
+        assert least == pytest.approx(-10 * share * MATCHER.motion_weight)
 
 
 def test_neighbors_are_compared_as_if_they_had_been_proposed(tiny_prior, room):
