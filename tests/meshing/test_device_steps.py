@@ -101,6 +101,24 @@ def test_planes_are_the_same_but_for_their_sign(name):
     assert float(found.residual) == pytest.approx(residual, abs=1e-4)
 
 
+@jax.jit
+def slope_of_normals(points):
+    def total(x):
+        every = jnp.ones(len(x), bool)
+        _, neighbors = nearest_neighbors(x, every, 8)
+        return (device_planes.fit_planes(x, every, neighbors).normal * jnp.arange(1.0, 4.0)).sum()
+
+    return jax.grad(total)(points)
+
+
+@pytest.mark.parametrize("spread", [1e-1, 1e-4, 1e-8, 1e-10, 1e-13, 1e-16, 1e-20, 0.0])
+@pytest.mark.parametrize("place", [0.0, 1e-8, 0.1])
+def test_normals_of_neighbors_however_close_have_finite_slopes(place, spread):
+    noise = np.random.default_rng(0).normal(size=(40, 3))
+    slope = np.asarray(slope_of_normals(jnp.asarray(place + spread * noise, jnp.float32)))
+    assert np.isfinite(slope).all() and (np.abs(slope).max() > 0) == (spread > 1e-6)
+
+
 @pytest.mark.parametrize(("lowest", "slope"), [(-np.inf, 0.45), (-0.2, 0.45), (-np.inf, 0.25)])
 def test_rays_go_as_far_as_by_tree(lowest, slope):
     """Also past the origin, where padding lies."""

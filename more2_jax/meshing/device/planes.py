@@ -15,7 +15,9 @@ from more2_jax.meshing.screened_poisson import SAME_FACE_COSINE, SAME_FACE_FLATN
 from more2_jax.types import pytree, quantity
 
 TINY = 1e-30
-ROUNDING = 4 * float(jnp.finfo(jnp.float32).eps)  # of coordinates: closer points are at one place
+ONE_PLACE = 4 * float(
+    jnp.finfo(jnp.float32).eps
+)  # closer points of an object of about unit size are at one place
 
 Points = Float[Array, "n 3"]
 Neighbors = Int[Array, "n k"]
@@ -61,15 +63,14 @@ def face_normals(points: Points, neighbors: Neighbors, otherwise: Points) -> Poi
 
 
 def moments(points: Points, neighbors: Neighbors) -> tuple[Points, Float[Array, "n 3 3"]]:
-    """Mean and covariance of each point's neighbors; the covariance of neighbors at one place is zero.
+    """Mean and covariance of each point's neighbors; of neighbors at one place it is zero.
 
-    What rounding leaves of it there would be divided by itself, and gradients overflow.
+    What rounding leaves of it there would be divided by itself, and gradients would overflow.
     """
-    there = at_rows(points, neighbors)
-    center = there.mean(axis=1)
-    around = there - center[:, None]
-    least = ROUNDING * jnp.abs(there).max(axis=(1, 2), keepdims=True)
-    around = jnp.where(jnp.abs(around).max(axis=(1, 2), keepdims=True) > least, around, 0.0)
+    around = at_rows(points, neighbors)
+    center = around.mean(axis=1)
+    around = around - center[:, None]
+    around = jnp.where(jnp.abs(around).max(axis=(1, 2), keepdims=True) > ONE_PLACE, around, 0.0)
     return center, jnp.einsum("nki,nkj->nij", around, around) / neighbors.shape[1]
 
 
