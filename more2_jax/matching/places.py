@@ -25,7 +25,7 @@ from more2_jax.network.prior import Prior
 STAYED_M, STAYED_DEG, STAYED_TURNED_M = 0.15, 10.0, 0.06
 OTHER_COLOR = -1.0  # log likelihood ratio: what has less is of another color
 # Of what a meter costs, in any orientation: without heights right pairs are less sure of one another, and four meters
-# outvoted them (docs/developing/notebook/matching_any_orientation.md).
+# outvoted them (docs/developing/notebook/places.md).
 FREE_SHARE = 0.25
 BY_PAIR = ("rows", "T_old_new", "top_gap_m", "off", "off_own")  # arrays of `AlignedPairs`
 BESIDE_M = 0.6  # centers of an object and of what a damaged mask shows of it, where it was
