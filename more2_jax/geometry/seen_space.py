@@ -85,10 +85,15 @@ class SeenBlock:
     def of(cls, points: Points) -> SeenBlock:
         """From the points in any order."""
         number = numbered(column_of(points))
-        order = np.lexsort((points[:, 2], number))
+        if not len(points):
+            return cls(tree=None, column=number, lowest=points[:, 2])
+        order = np.argsort(number)
         column, first = np.unique(number[order], return_index=True)
-        tree = KDTree(points) if len(points) else None
-        return cls(tree=tree, column=column, lowest=points[order, 2][first])
+        lowest = np.minimum.reduceat(points[order, 2], first)
+        # Made in less time than a balanced one; few questions are asked of it.
+        return cls(
+            tree=KDTree(points, compact_nodes=False, balanced_tree=False), column=column, lowest=lowest
+        )
 
     def empty(
         self, places: Float[np.ndarray, "n 3"], column: Int[np.ndarray, "n 2"], reach_m: float

@@ -152,9 +152,26 @@ def align_candidates(
     both scans show, upright; by default objects and instances alone. `place`: the same motion as far as it says where
     partners are sought (`proposals`), by default `T_scene_scan`. Raises ValueError as `check_asked` does.
     """
-    check_asked(prior, (*old, *new), matcher, motion)
     T = np.eye(4) if T_scene_scan is None else T_scene_scan
     worth = proposed(old, new, matcher, T if place is None else place)
+    return align_proposed(prior, (old, new), worth, matcher, motion, T, seen)
+
+
+def align_proposed(
+    prior: Prior,
+    clouds: tuple[Sequence[ObservedObject], Sequence[ObservedObject]],
+    worth: Proposed,
+    matcher: EvidenceMatcher,
+    motion: MotionModel,
+    T_scene_scan: Pose,
+    seen: Seen | None = None,
+) -> AlignedPairs:
+    """Aligns the pairs `worth` it of `clouds`: objects (scene's frame) and instances (scan's frame), one at least.
+
+    `T_scene_scan`, `seen` and errors as in `align_candidates`.
+    """
+    old, new = clouds
+    check_asked(prior, (*old, *new), matcher, motion)
     few = max(len(old), len(new)) <= OBJECTS_AT_ONCE
     instances, objects = (prepared(x, matcher.search, motion, few) for x in (new, old))
     return aligned_pairs(
@@ -162,7 +179,7 @@ def align_candidates(
         (instances, objects),
         worth,
         (matcher.search, motion),
-        T,
+        T_scene_scan,
         (seen or seen_in(old, new)) if motion == "upright" else None,
     )
 

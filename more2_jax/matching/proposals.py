@@ -7,7 +7,7 @@ instances there is never an array of n × m.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -43,6 +43,11 @@ class Proposed:
     likeness: Float[np.ndarray, " p"]  # cosine of the F_inv
     # How many instances are likelier partners of the object, and objects of the instance; infinite where too many.
     rank: Float[np.ndarray, "p 2"]
+
+    def among(self, pairs: Collection[tuple[int, int]]) -> Proposed:
+        """Those of the pairs that are among some, in their order."""
+        kept = np.array([(k, i) in pairs for k, i in self.pairs.tolist()], bool)
+        return Proposed(pairs=self.pairs[kept], likeness=self.likeness[kept], rank=self.rank[kept])
 
 
 def signatures(side: Sequence[ObservedObject], place: Pose | None = None) -> Signatures:

@@ -23,13 +23,13 @@ from more2_jax.network.shared_calls import program_key
 Tree = Any  # of arrays
 Rows = Int[np.ndarray, " k"]
 
-MOST_BYTES = 64_000_000  # of results that are held; the oldest go first
+MOST_BYTES = 64_000_000  # of a function's results that are held; the oldest go first
 DIGESTED_AT_ONCE = 64  # rows: what many rows share is held once a row while they are told apart
 
 
 @dataclass(eq=False)
 class RememberedRows:
-    """Results by what they were computed of."""
+    """Results of one program by what they were computed of."""
 
     most_bytes: int = MOST_BYTES
     size_bytes: int = 0
@@ -44,16 +44,28 @@ class RememberedRows:
             self.size_bytes -= bytes_of(oldest)
 
 
-CURRENT: ContextVar[RememberedRows | None] = ContextVar("rows remembered in this context", default=None)
+@dataclass(eq=False)
+class RememberedPrograms:
+    """What is remembered of every program, apart: prepared clouds are large, and poses that a search found small."""
+
+    most_bytes: int = MOST_BYTES
+    rows: dict[Hashable, RememberedRows] = field(default_factory=dict)
+
+    def of(self, program: Hashable) -> RememberedRows:
+        """The results of a program."""
+        return self.rows.setdefault(program, RememberedRows(self.most_bytes))
+
+
+CURRENT: ContextVar[RememberedPrograms | None] = ContextVar("rows remembered in this context", default=None)
 
 
 @contextmanager
-def rows_remembered() -> Iterator[RememberedRows]:
+def rows_remembered() -> Iterator[RememberedPrograms]:
     """Inside, `only_new` computes equal rows once."""
-    rows = RememberedRows()
-    token = CURRENT.set(rows)
+    programs = RememberedPrograms()
+    token = CURRENT.set(programs)
     try:
-        yield rows
+        yield programs
     finally:
         CURRENT.reset(token)
 
@@ -69,10 +81,11 @@ def only_new(
     `taken` gives rows as `function` takes them, `computed` the results of some. Outside `rows_remembered` all are
     computed.
     """
-    memory, every = CURRENT.get(), np.arange(count)
-    if memory is None or not count:
+    programs, every = CURRENT.get(), np.arange(count)
+    if programs is None or not count:
         return computed(every)
-    keys = keys_of(function, count, taken)
+    memory = programs.of(program_key(function, taken(every[:1])))
+    keys = keys_of(count, taken)
     known = {key: memory.found[key] for key in keys if key in memory.found}
     new = np.array([n for n, key in enumerate(keys) if key not in known], int)
     results = computed(new) if len(new) else None
@@ -90,13 +103,13 @@ def row_of(results: Tree, row: int) -> Tree:
     return jax.tree.map(lambda x: np.asarray(x)[row : row + 1], results)
 
 
-def keys_of(function: Callable[[Tree], Tree], count: int, taken: Callable[[Rows], Tree]) -> list[Hashable]:
+def keys_of(count: int, taken: Callable[[Rows], Tree]) -> list[bytes]:
     """What tells every row from all others that are not equal to it."""
-    keys = list[Hashable]()
+    keys = list[bytes]()
     for start in range(0, count, DIGESTED_AT_ONCE):
-        some = jax.tree.map(np.asarray, taken(np.arange(start, min(start + DIGESTED_AT_ONCE, count))))
-        program, leaves = program_key(function, some), jax.tree.leaves(some)
-        keys += [(program, digest([x[k : k + 1] for x in leaves])) for k in range(len(leaves[0]))]
+        some = taken(np.arange(start, min(start + DIGESTED_AT_ONCE, count)))
+        leaves = [np.asarray(x) for x in jax.tree.leaves(some)]
+        keys += [digest([x[k : k + 1] for x in leaves]) for k in range(len(leaves[0]))]
     return keys
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -14,7 +14,8 @@ from more2_jax.config import EvidenceMatcher, SceneConfig
 from more2_jax.geometry.poses import Points, Pose, apply_pose
 from more2_jax.matching.assignment import NEVER
 from more2_jax.matching.calibration import even_odds
-from more2_jax.matching.candidates import AlignedPairs, align_candidates, evidence_at, odds_of
+from more2_jax.matching.candidates import AlignedPairs, align_proposed, evidence_at, odds_of
+from more2_jax.matching.proposals import Proposed, proposed
 from more2_jax.network.prior import Prior
 from more2_jax.tracking.identify import Identified
 from more2_jax.types import ObservedObject
@@ -95,32 +96,52 @@ class Comparison:
         return self.odds_of_others([old], [new]).get((0, 0), NEVER)
 
     def odds_of_others(
-        self, old: Iterable[ObservedObject], new: Iterable[ObservedObject], *, halves: bool = False
+        self,
+        old: Iterable[ObservedObject],
+        new: Iterable[ObservedObject],
+        among: Collection[tuple[int, int]] | None = None,
+        *,
+        halves: bool = False,
     ) -> dict[tuple[int, int], float]:
-        """Log odds of clouds of both scans that were not compared, by rows of `old` and `new`.
+        """Log odds of clouds of both scans that were not compared, by rows of `old` and `new`; of pairs `among` some.
 
         Those of halves are small without being what people carry about.
         """
-        aligned = self.align_others(old, new)
+        old, new = list(old), list(new)
+        worth = self.proposed_others(old, new)
+        worth = worth if among is None else worth.among(among)
+        if not len(worth.pairs):
+            return {}
+        # What is part of no pair is not prepared.
+        rows, at = zip(*(np.unique(side, return_inverse=True) for side in worth.pairs.T), strict=True)
+        clouds = [old[k] for k in rows[0]], [new[i] for i in rows[1]]
+        aligned = self.align_others(clouds, dataclasses.replace(worth, pairs=np.stack(at, axis=1)))
         if halves:
             known = dataclasses.replace(aligned.compared, portable=np.zeros(len(aligned.rows)))
             aligned = dataclasses.replace(aligned, compared=known)
         odds = odds_of(aligned, self.matcher.search, self.config.motion, self.height_m())
-        return {(k, i): z for (k, i), z in zip(odds.pairs.tolist(), odds.value.tolist(), strict=True)}
+        return {(k, i): z for (k, i), z in zip(worth.pairs.tolist(), odds.value.tolist(), strict=True)}
 
     def poses_of_others(
         self, old: Iterable[ObservedObject], new: Iterable[ObservedObject]
     ) -> dict[tuple[int, int], tuple[float, Pose]]:
         """As `odds_of_others`, with the pose that fits best: T_old_new."""
-        aligned, search, motion = self.align_others(old, new), self.matcher.search, self.config.motion
+        clouds, search, motion = (list(old), list(new)), self.matcher.search, self.config.motion
+        aligned = self.align_others(clouds, self.proposed_others(*clouds))
         odds = odds_of(aligned, search, motion, self.height_m())
         best = evidence_at(aligned, search, motion, self.height_m()).pose
         T = aligned.T_old_new[np.arange(len(best)), best]
         rows = zip(odds.pairs.tolist(), odds.value.tolist(), T, strict=True)
         return {(k, i): (z, pose) for (k, i), z, pose in rows}
 
-    def align_others(self, old: Iterable[ObservedObject], new: Iterable[ObservedObject]) -> AlignedPairs:
-        """The likeliest pairs of clouds that were not compared, aligned."""
-        matcher = dataclasses.replace(self.matcher, candidates=CANDIDATES)
+    def proposed_others(self, old: Sequence[ObservedObject], new: Sequence[ObservedObject]) -> Proposed:
+        """The likeliest pairs of clouds that were not compared."""
+        few = dataclasses.replace(self.matcher, candidates=CANDIDATES)
+        return proposed(old, new, few, self.identified.frame.T_scene_scan)
+
+    def align_others(
+        self, clouds: tuple[Sequence[ObservedObject], Sequence[ObservedObject]], worth: Proposed
+    ) -> AlignedPairs:
+        """Pairs of such clouds, aligned."""
         T, seen = self.identified.frame.T_scene_scan, self.aligned.seen
-        return align_candidates(self.prior, list(old), list(new), matcher, self.config.motion, T, seen)
+        return align_proposed(self.prior, clouds, worth, self.matcher, self.config.motion, T, seen)

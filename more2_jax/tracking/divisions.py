@@ -6,7 +6,7 @@ The decision alone, from log odds that surfaces give (`merged_masks`).
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -57,8 +57,9 @@ class Division:
 
 
 # Log odds of parts with those of the other scan's clouds that are named, by the numbers of both in these lists:
-# (other, part). Those that cannot be one are left out.
-Weigh = Callable[[Sequence[Part], Sequence[int]], Mapping[tuple[int, int], float]]
+# (other, part), among those that are asked for. What cannot be one is left out.
+Pairs = Collection[tuple[int, int]]
+Weigh = Callable[[Sequence[Part], Sequence[int], Pairs], Mapping[tuple[int, int], float]]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -124,8 +125,8 @@ def chosen(halves: Sequence[tuple[Part, Part]], wholes: Wholes, weigh: Weigh) ->
     if not halves:
         return []
     others = sorted({k for pair in halves for p in pair for k in wholes.may_be(p)})
-    odds = weigh([p for pair in halves for p in pair], others)
-    row = {k: n for n, k in enumerate(others)}
+    parts, row = [p for pair in halves for p in pair], {k: n for n, k in enumerate(others)}
+    odds = weigh(parts, others, {(row[k], n) for n, p in enumerate(parts) for k in wholes.may_be(p)})
     return compatible(
         [
             division

@@ -145,8 +145,8 @@ def divisions_of_instances(
     return chosen(
         halves_of(compared, cuts, [(i.points, i.normals) for i in instances]),
         wholes,
-        lambda parts, others: compared.odds_of_others(
-            [compared.old[k] for k in others], map(half, parts), halves=True
+        lambda parts, others, among: compared.odds_of_others(
+            [compared.old[k] for k in others], map(half, parts), among, halves=True
         ),
     )
 
@@ -180,10 +180,10 @@ def divisions_of_objects(
     return chosen(
         halves_of(compared, cuts, [(o.points, o.normals) for o in objects]),
         wholes,
-        lambda parts, others: {
+        lambda parts, others, among: {
             (i, part): z
             for (part, i), z in compared.odds_of_others(
-                map(half, parts), [compared.new[i] for i in others], halves=True
+                map(half, parts), [compared.new[i] for i in others], {(p, i) for i, p in among}, halves=True
             ).items()
         },
     )

@@ -104,8 +104,20 @@ def test_no_more_is_held_than_allowed_and_the_newest_stays(most):
 
 def test_a_row_given_up_is_computed_again_with_the_same_result():
     counted = Counted()
-    with rows_remembered() as memory:
-        memory.most_bytes = 60  # of two rows, 24 bytes each
+    with rows_remembered() as programs:
+        programs.most_bytes = 60  # of two rows, 24 bytes each
         same(counted.of(ROWS), squares(ROWS))
         same(counted.of(ROWS), squares(ROWS))
     assert counted.counts == [6, 4]
+
+
+def test_results_of_one_program_do_not_push_out_those_of_another():
+    counted = Counted()
+    with rows_remembered() as programs:
+        programs.most_bytes = 6 * 24
+        counted.of(ROWS)
+        for n in range(5):
+            counted.of(ROWS | {"a": ROWS["a"] + 100 * n}, cubes)
+        same(counted.of(ROWS), squares(ROWS))
+    assert len(programs.rows) == 2
+    assert counted.counts == [6] * 6

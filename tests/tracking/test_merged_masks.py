@@ -59,7 +59,16 @@ def decided(
         doubtful=dict(doubtful),
         both_known=both_known,
     )
-    return chosen([pair(narrow=narrow)], wholes, lambda _, others: dict(np.ndenumerate(odds[others])))
+    halves = pair(narrow=narrow)
+
+    def weigh(parts, others, among):
+        assert parts == list(halves)
+        assert {(others[row], part) for row, part in among} == {
+            (k, part) for part, half in enumerate(halves) for k in wholes.may_be(half)
+        }
+        return {at: z for at, z in np.ndenumerate(odds[others]) if at in among}
+
+    return chosen([halves], wholes, weigh)
 
 
 @pytest.mark.parametrize(
