@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -12,6 +12,7 @@ from eval.peers.reconstruction import Surfacer, ball_pivoting
 from eval.peers.registration import TRUNCATED, best_fit, starts
 from eval.scores.tracks import Track
 from more2_jax.geometry.poses import Points, Pose, apply_pose
+from more2_jax.matching.calibration import alone_probability
 from more2_jax.types import Instance, Scan
 
 NAME = "all-pairs GICP + multi-start GICP + ball pivoting"
@@ -45,6 +46,7 @@ def combined(scans: Sequence[Scan], stages: Stages) -> list[Track]:
     """
     tracks: list[Track] = []
     for k, scan in enumerate(scans):
+        before = [k - 1 in t.instance for t in tracks]
         new = [i for i in scan.instances if len(i.points) >= FEWEST]
         old = [Instance(id=n, points=t.points) for n, t in enumerate(tracks)]
         matched = stages.match(old, new) if old and new else {}
@@ -54,7 +56,19 @@ def combined(scans: Sequence[Scan], stages: Stages) -> list[Track]:
             if found is not None and found[1] <= stages.reject:
                 tracks[n] = extended(tracks[n], k, by_id.pop(id_), *found)
         tracks += [begun(k, i) for i in by_id.values()]
+        tracks = less_sure(tracks, [*before, *[False] * len(by_id)], k) if k else tracks
     return [Track(**{**vars(t), "mesh": stages.surface(t.points)}) for t in tracks]
+
+
+def less_sure(tracks: Sequence[Track], before: Sequence[bool], k: int) -> list[Track]:
+    """The tracks, those that scan `k` or the one before alone has no surer than ours are (`alone_probability`)."""
+    now = [k in t.instance for t in tracks]
+    alone = [
+        (a and not b) or (b and len(t.instance) == 1) for t, a, b in zip(tracks, before, now, strict=True)
+    ]
+    there = sum(a or b for a, b in zip(before, now, strict=True))
+    chance = alone_probability(max(sum(alone) - 1, 0) / max(there, 1))
+    return [replace(t, score=min(t.score, chance)) if a else t for t, a in zip(tracks, alone, strict=True)]
 
 
 def begun(scan: int, i: Instance) -> Track:

@@ -25,7 +25,7 @@ class Track:
     T_track_scan: dict[int, Pose]
     points: Float[np.ndarray, "n 3"]
     mesh: Mesh | None = None
-    score: float = 1.0  # of its least sure match, coming or going; 0 to 1
+    score: float = 1.0  # of its least sure match, or of its absence from a scan; 0 to 1
     seen: dict[int, Float[np.ndarray, "n 3"]] = field(
         default_factory=dict
     )  # by scan, its own points, where masks were mended; else those of its instance
@@ -41,7 +41,7 @@ def tracks_of(scene: LivingScene) -> list[Track]:
             T_track_scan={seen.scan: seen.T_ref_scan for seen in o.observations},
             points=accumulated_points(o),
             mesh=o.mesh,
-            score=min(*(seen.score for seen in o.observations), *came_or_went(scene, o.id), 1.0),
+            score=min(*(seen.score for seen in o.observations), *in_one_scan(scene, o.id), 1.0),
             seen={seen.scan: points_of(o, seen) for seen in o.observations},
             moved={c.to_scan: o.id in c.moved for c in scene.changes if o.id in c.moved + c.static},
             not_seen=frozenset(s.index for s in scene.scans if o.id in s.not_seen),
@@ -50,9 +50,13 @@ def tracks_of(scene: LivingScene) -> list[Track]:
     ]
 
 
-def came_or_went(scene: LivingScene, id_: str) -> list[float]:
-    """How probable it is that an object came when it is said to have come, and went."""
-    return [c.probability[id_] for c in scene.changes if id_ in c.probability and id_ in c.added + c.removed]
+def in_one_scan(scene: LivingScene, id_: str) -> list[float]:
+    """How probable it is that an object was in one scan alone, of every pair of scans where that is said of it."""
+    return [
+        c.probability[id_]
+        for c in scene.changes
+        if id_ in c.probability and id_ in c.added + c.removed + c.not_seen + c.discovered
+    ]
 
 
 def track_with(tracks: Sequence[Track], scan: int, instance: int) -> Track | None:

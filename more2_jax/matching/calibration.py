@@ -80,6 +80,8 @@ FREE = Calibration(
 )
 # Without the prior's say.
 UNASKED = Calibration(intercept=3.7, likeness=5.8, apart_less=-6.3, apart_more=-6.1, raised=3.0)
+# Log odds that what one scan alone seems to have is not in the other, and what a share of further such things takes.
+ALONE, ALONE_LESS = 1.7, 6.2
 
 
 def calibrated(
@@ -102,6 +104,15 @@ def probability(
 ) -> Float[np.ndarray, "*pairs"]:
     """Of pairs to be one object, by their log odds as `calibrated` has them."""
     return expit(odds - even_odds(search, motion))
+
+
+def alone_probability(others: float) -> float:
+    """That what one scan alone seems to have is really not in the other, where nothing that is left there is like it.
+
+    `others`: of all things that either scan has, the share of further ones that one scan alone seems to have. Many are
+    a sign that masks are damaged, or that partners were taken by others.
+    """
+    return float(expit(ALONE - ALONE_LESS * others))
 
 
 def even_odds(search: SurfaceSearch, motion: MotionModel) -> float:

@@ -46,8 +46,9 @@ def product(h: Float[Array, "n i"], kernel: Float[Array, "i o"], train: bool) ->
 
 
 def bfloat16_product(h: Float[Array, "n i"], kernel: Float[Array, "i o"]) -> Float[Array, "n o"]:
-    """Factors rounded to bfloat16, their products added in float32."""
-    return jnp.matmul(h.astype(jnp.bfloat16), kernel.astype(jnp.bfloat16), preferred_element_type=jnp.float32)
+    """Factors rounded to bfloat16, their products added in float32; as the input is otherwise."""
+    factors = h.astype(jnp.bfloat16), kernel.astype(jnp.bfloat16)
+    return jnp.matmul(*factors, preferred_element_type=jnp.float32).astype(h.dtype)
 
 
 class WeightNormDense(nn.Module):

@@ -49,7 +49,7 @@ def verdict(o: SceneObject, changes: Changes) -> Verdict:
     status = told[0] if told else "absent"
     chance = changes.probability.get(o.id, 1.0)
     if told and chance < UNLIKELY:
-        doubts += (f"{status} with a probability of {chance:.0%} only",)
+        doubts += (f"{status.replace('_', ' ')} with a probability of {chance:.0%} only",)
     if before is None and status in ("moved", "static"):  # the scan before did not look for it
         before = max((s for s in o.observations if s.scan < changes.from_scan), key=lambda s: s.scan)
     if before is None or after is None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence, Sized
 
 import numpy as np
 from scipy.special import ndtr
@@ -15,6 +15,7 @@ from more2_jax.types import Changes, LivingScene, Observation, ScanRecord, Scene
 # Registration takes correspondences as independent: true errors are larger than it says, by about this much.
 OPTIMISM = 3.0
 SURE = 2.0  # standard errors that a motion must exceed
+FEW_THINGS = 8  # as rooms have: of fewer, one that one scan alone has is no large share
 
 KINDS = ("moved", "static", "added", "removed", "not_seen", "discovered")
 # Of a scan, the ids of objects that it cannot tell it lacks.
@@ -31,8 +32,8 @@ def changes_between(
 ) -> Changes:
     """What moved, stayed, came (also: came back), went, and was not seen between two scans.
 
-    `chance`: probabilities, by object, that what came or went did. Those of motion are worked out here. An object
-    that scan `a` did not look for is compared with the scan that did.
+    `chance`: probabilities, by object, that one scan alone has it. Those of motion are worked out here. An object that
+    scan `a` did not look for is compared with the scan that did.
     """
     found: dict[str, list[str]] = {kind: [] for kind in KINDS}
     probability: dict[str, float] = {}
@@ -43,14 +44,12 @@ def changes_between(
             moved = moved_probability(o, before, after, config)
             found["moved" if moved > 0.5 else "static"].append(o.id)
             probability[o.id] = max(moved, 1 - moved)
-        elif before and o.id in not_seen.get(b, ()):
-            found["not_seen"].append(o.id)
-        elif after and not looked_for(o, a, not_seen):
-            found["discovered"].append(o.id)
-        elif before or after:
-            found["removed" if before else "added"].append(o.id)
-            if chance and o.id in chance:
-                probability[o.id] = chance[o.id]
+        elif before:
+            found["not_seen" if o.id in not_seen.get(b, ()) else "removed"].append(o.id)
+        elif after:
+            found["added" if looked_for(o, a, not_seen) else "discovered"].append(o.id)
+        if bool(before) != bool(after) and chance and o.id in chance:
+            probability[o.id] = chance[o.id]
     lists = {k: tuple(v) for k, v in found.items()}
     return Changes(from_scan=a, to_scan=b, **lists, probability=probability)
 
@@ -93,6 +92,20 @@ def last_known(o: SceneObject, scan: int, not_seen: NotSeen) -> Observation | No
 def looked_for(o: SceneObject, scan: int, not_seen: NotSeen) -> bool:
     """Whether this scan or one before it looked where an object stands that was found later."""
     return any(o.id not in not_seen.get(k, ()) for k in range(scan + 1))
+
+
+def share_alone(
+    objects: Sequence[SceneObject], missing: Sequence[int], fresh: Sized, scans: Sequence[ScanRecord]
+) -> float:
+    """Of all things that the last of the `scans` or a new one shows, what one of them alone shows, the first aside.
+
+    `missing`: rows of the objects that were not found in the new one; `fresh`: what is new in it. In small scenes a
+    share of `FEW_THINGS`.
+    """
+    last, not_seen = scans[-1].index, not_seen_in(scans)
+    there = [o.observations[-1].scan > last or last_known(o, last, not_seen) is not None for o in objects]
+    alone = sum(there[k] for k in missing) + len(fresh)
+    return max(alone - 1, 0) / max(sum(there) + len(fresh), FEW_THINGS)
 
 
 def moved_probability(o: SceneObject, before: Observation, after: Observation, config: SceneConfig) -> float:

@@ -9,7 +9,7 @@ import numpy as np
 
 from more2_jax.config import CodeMatcher, EvidenceMatcher, SceneConfig
 from more2_jax.matching.assignment import Chosen, LogOdds, assign, interchangeable, unmatched
-from more2_jax.matching.calibration import probability
+from more2_jax.matching.calibration import alone_probability, probability
 from more2_jax.matching.candidates import AlignedPairs, odds_of
 from more2_jax.matching.code_assignment import match_instances
 from more2_jax.matching.places import motion_odds
@@ -135,13 +135,15 @@ def chances(
     identified: Identified,
     objects: Sequence[SceneObject],
     fresh: Mapping[int, SceneObject],
+    others: float,
     config: SceneConfig,
 ) -> dict[str, float]:
     """Returns by object id the probability that it is really gone, back or new.
 
-    `fresh`: new objects by the rows of their instances.
+    `fresh`: new objects by the rows of their instances. `others`: as `alone_probability` takes it.
     """
-    gone = {objects[k].id: p for k, p in identified.gone.items()}
+    alone = alone_probability(others)
+    gone = {objects[k].id: alone * p for k, p in identified.gone.items()}
     known = isinstance(config.matching, EvidenceMatcher)
     back = {objects[f.object].id: f.score for f in identified.found if known}
-    return gone | back | {fresh[i].id: p for i, p in identified.new.items() if i in fresh}
+    return gone | back | {fresh[i].id: alone * p for i, p in identified.new.items() if i in fresh}

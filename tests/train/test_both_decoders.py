@@ -47,18 +47,27 @@ def shapes(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def gradients(both, shapes, training):
-    """Loss terms, and gradient by all weights: of both decoders together, then of each alone."""
+    """Loss terms, and gradient by all weights: of both decoders together, then of each alone.
+
+    In float64: rounding must not send a unit to the other side of its kink in one of the programs alone.
+    """
     draw = jax.jit(sample_batch, static_argnames=("config", "points"))
     sample = draw(jax.random.key(5), shapes, jnp.arange(2), training, points=64)
 
     @jax.jit
-    def gradient(prior):
+    def gradient(prior, sample):
         def loss(params):
             return total_loss(dataclasses.replace(prior, params=params), sample, training, jax.random.key(1))
 
         return jax.grad(loss, has_aux=True)(prior.params)
 
-    return [gradient(p) for p in (both, one_decoder(both, normals=True), one_decoder(both, normals=False))]
+    alone = one_decoder(both, normals=True), one_decoder(both, normals=False)
+    with jax.enable_x64(True):
+        return [gradient(*jax.tree.map(doubled, (prior, sample))) for prior in (both, *alone)]
+
+
+def doubled(x):
+    return jnp.asarray(x, jnp.float64) if jnp.issubdtype(x.dtype, jnp.floating) else x
 
 
 @pytest.mark.slow
