@@ -25,7 +25,7 @@ from more2_jax.refinement.joint_of_objects import fit_objects
 from more2_jax.refinement.pose_graph_of_objects import refine_object_poses
 from more2_jax.registration.pose_costs import asks_sensors
 from more2_jax.tracking.accumulated import accumulated_objects, embed_accumulated, readable, with_refined
-from more2_jax.tracking.changes import changes_between, forgotten, not_seen_in, share_alone
+from more2_jax.tracking.changes import changes_between, counted_alone, forgotten, not_seen_in
 from more2_jax.tracking.comparison import Comparison
 from more2_jax.tracking.identify import Found, Identified, chances, identify, with_left_over
 from more2_jax.tracking.joined_masks import join_parts
@@ -195,7 +195,7 @@ def added(
     missing, left = mended.left_over([(f.object, f.instance) for f in found])
     unseen = not_looked_at(objects, missing, level, frame, scene.upright)
     fresh = new_objects(next_number(objects, scene.scans), index, left, whole.instances, codes, frame)
-    chance = chances(identified, objects, fresh, share_alone(objects, missing, fresh, scene.scans), config)
+    chance = chances(identified, objects, fresh, counted_alone(objects, missing, fresh, scene.scans), config)
     objects, frame = as_given([*mended.whole(objects), *fresh.values()], index, frame, T_level_scan)
     before = not_looked_at_before(objects, list(fresh.values()), scene.scans, scene.upright)
     repairs = (*whole.repairs, *whole.masks(found, fresh), *mended.repairs)

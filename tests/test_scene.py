@@ -18,7 +18,7 @@ from more2_jax.meshing.object_mesh import object_floor
 from more2_jax.registration import search, surface
 from more2_jax.scene import add_scan, reconstruct, start_scene
 from more2_jax.tracking.accumulated import accumulated_object
-from more2_jax.tracking.changes import FEW_THINGS, moved_probability, share_alone
+from more2_jax.tracking.changes import counted_alone, moved_probability
 from more2_jax.tracking.objects import points_of
 from more2_jax.types import Instance, Mesh, Scan
 
@@ -68,28 +68,28 @@ def test_all_that_is_said_of_changes_has_a_probability(scene):
     for c in scene.changes:
         assert set(c.probability) == {*c.static, *c.moved, *c.added, *c.removed}
         assert all(0.5 < p <= 1 for p in c.probability.values())
-    # One thing went and another came; where one comes back, it is by its match that it is told.
+    # One thing went and another came, of three; where one comes back, it is by its match that it is told.
     first, second = scene.changes
     assert [first.probability[i] for i in (*first.added, *first.removed)] == pytest.approx(
-        [alone_probability(1 / FEW_THINGS)] * 2, abs=0.02
+        [alone_probability(2, 3)] * 2, abs=0.02
     )
     (back,) = second.added
     (o,) = (o for o in scene.objects if o.id == back)
     assert second.probability[back] == o.observations[-1].score
 
 
-def test_what_one_scan_alone_has_is_the_less_sure_the_more_there_is_of_it(scene):
-    def share(missing, new):
-        return share_alone(scene.objects * 4, missing, range(new), scene.scans)
+def test_what_one_scan_alone_has_is_counted_and_the_less_sure_the_more_there_is(scene):
+    def counted(missing, new):
+        return counted_alone(scene.objects * 4, missing, range(new), scene.scans)
 
-    assert share([0], 0) == share([], 1) == share([], 0) == 0.0
-    assert [share([0, 3], 0), share([0], 1), share([0, 3], 3)] == pytest.approx([1 / 12, 1 / 13, 4 / 15])
+    assert [counted([], 0), counted([0], 0), counted([0, 3], 3)] == [(0, 12), (1, 12), (5, 15)]
     # What was gone before is not missed again.
     went = next(o for o in scene.objects if o.label == "kind 1")
     gone, lost = (dataclasses.replace(went, observations=went.observations[k : k + 1]) for k in (0, 1))
-    assert share_alone([gone] * 9 + [lost], range(10), [went], scene.scans) == 1 / FEW_THINGS
-    assert alone_probability(0.0) > 0.8 > 0.5 > alone_probability(3 / FEW_THINGS) > 0.0
-    assert not any(seen.interchangeable for o in scene.objects for seen in o.observations)
+    assert counted_alone([gone] * 9 + [lost], range(10), [went], scene.scans) == (2, 2)
+    chances = [alone_probability(alone, 20) for alone in range(1, 11)]
+    assert 0.9 > chances[0] > 0.8 and 0.3 > chances[-1] > 0.0 and (np.diff(chances) < 0).all()
+    assert alone_probability(1, 1) == alone_probability(1, 20)
 
 
 @pytest.mark.parametrize(

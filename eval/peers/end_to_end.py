@@ -67,7 +67,7 @@ def less_sure(tracks: Sequence[Track], before: Sequence[bool], k: int) -> list[T
         (a and not b) or (b and len(t.instance) == 1) for t, a, b in zip(tracks, before, now, strict=True)
     ]
     there = sum(a or b for a, b in zip(before, now, strict=True))
-    chance = alone_probability(max(sum(alone) - 1, 0) / max(there, 1))
+    chance = alone_probability(sum(alone), there)
     return [replace(t, score=min(t.score, chance)) if a else t for t, a in zip(tracks, alone, strict=True)]
 
 

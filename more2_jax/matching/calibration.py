@@ -82,6 +82,7 @@ FREE = Calibration(
 UNASKED = Calibration(intercept=3.7, likeness=5.8, apart_less=-6.3, apart_more=-6.1, raised=3.0)
 # Log odds that what one scan alone seems to have is not in the other, and what a share of further such things takes.
 ALONE, ALONE_LESS = 1.7, 6.2
+FEW_THINGS = 8  # as rooms have: of fewer, one more is no larger share
 
 
 def calibrated(
@@ -106,13 +107,14 @@ def probability(
     return expit(odds - even_odds(search, motion))
 
 
-def alone_probability(others: float) -> float:
+def alone_probability(alone: int, things: int) -> float:
     """That what one scan alone seems to have is really not in the other, where nothing that is left there is like it.
 
-    `others`: of all things that either scan has, the share of further ones that one scan alone seems to have. Many are
-    a sign that masks are damaged, or that partners were taken by others.
+    `alone`: how many things seem so, this one among them, of all that either scan has. Many are a sign that masks are
+    damaged, or that partners were taken by others.
     """
-    return float(expit(ALONE - ALONE_LESS * others))
+    share = max(alone - 1, 0) / max(things, FEW_THINGS)
+    return float(expit(ALONE - ALONE_LESS * share))
 
 
 def even_odds(search: SurfaceSearch, motion: MotionModel) -> float:

@@ -15,7 +15,6 @@ from more2_jax.types import Changes, LivingScene, Observation, ScanRecord, Scene
 # Registration takes correspondences as independent: true errors are larger than it says, by about this much.
 OPTIMISM = 3.0
 SURE = 2.0  # standard errors that a motion must exceed
-FEW_THINGS = 8  # as rooms have: of fewer, one that one scan alone has is no large share
 
 KINDS = ("moved", "static", "added", "removed", "not_seen", "discovered")
 # Of a scan, the ids of objects that it cannot tell it lacks.
@@ -94,18 +93,16 @@ def looked_for(o: SceneObject, scan: int, not_seen: NotSeen) -> bool:
     return any(o.id not in not_seen.get(k, ()) for k in range(scan + 1))
 
 
-def share_alone(
+def counted_alone(
     objects: Sequence[SceneObject], missing: Sequence[int], fresh: Sized, scans: Sequence[ScanRecord]
-) -> float:
-    """Of all things that the last of the `scans` or a new one shows, what one of them alone shows, the first aside.
+) -> tuple[int, int]:
+    """How many things the last of the `scans` or a new one alone shows, and how many either does.
 
-    `missing`: rows of the objects that were not found in the new one; `fresh`: what is new in it. In small scenes a
-    share of `FEW_THINGS`.
+    `missing`: rows of the objects that were not found in the new one; `fresh`: what is new in it.
     """
     last, not_seen = scans[-1].index, not_seen_in(scans)
     there = [o.observations[-1].scan > last or last_known(o, last, not_seen) is not None for o in objects]
-    alone = sum(there[k] for k in missing) + len(fresh)
-    return max(alone - 1, 0) / max(sum(there) + len(fresh), FEW_THINGS)
+    return sum(there[k] for k in missing) + len(fresh), sum(there) + len(fresh)
 
 
 def moved_probability(o: SceneObject, before: Observation, after: Observation, config: SceneConfig) -> float:

@@ -135,14 +135,14 @@ def chances(
     identified: Identified,
     objects: Sequence[SceneObject],
     fresh: Mapping[int, SceneObject],
-    others: float,
+    counted: tuple[int, int],
     config: SceneConfig,
 ) -> dict[str, float]:
     """Returns by object id the probability that it is really gone, back or new.
 
-    `fresh`: new objects by the rows of their instances. `others`: as `alone_probability` takes it.
+    `fresh`: new objects by the rows of their instances. `counted`: as `alone_probability` takes them.
     """
-    alone = alone_probability(others)
+    alone = alone_probability(*counted)
     gone = {objects[k].id: alone * p for k, p in identified.gone.items()}
     known = isinstance(config.matching, EvidenceMatcher)
     back = {objects[f.object].id: f.score for f in identified.found if known}

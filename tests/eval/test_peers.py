@@ -160,6 +160,19 @@ def test_the_peers_together_follow_a_scene():
     assert all(t.mesh is not None and len(t.points) == 3000 for t in tracks)
 
 
+def test_what_one_scan_alone_has_is_as_sure_with_peers_as_with_ours():
+    from eval.peers.end_to_end import less_sure
+    from eval.scores.tracks import Track
+    from more2_jax.matching.calibration import alone_probability
+
+    scans = [(0, 1), (0,), (1, 2), (0, 2), (2,)]  # that have each; the second was gone in 1 already
+    tracks = [Track(instance=dict.fromkeys(s, 1), T_track_scan={}, points=np.zeros((1, 3))) for s in scans]
+    found = less_sure(tracks, [1 in s for s in scans], 2)
+    # The first went and the last came: one besides each, of four things that either scan has.
+    least = alone_probability(2, 4)
+    assert [t.score for t in found] == [least, 1.0, 1.0, 1.0, least]
+
+
 @pytest.mark.parametrize(("apart", "reject"), [(0.01, 0.05), (0.08, 0.05), (0.08, np.inf)])
 def test_stages_are_asked_in_turn_and_a_pair_that_fits_badly_is_none_where_asked(apart, reject):
     from eval.peers.end_to_end import Stages, combined

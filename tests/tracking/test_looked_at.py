@@ -210,6 +210,18 @@ def test_an_object_that_was_discovered_is_known_from_then_on():
     assert changes_between([o], 0, 1, CONFIG).added == (o.id,)
 
 
+@pytest.mark.parametrize(
+    ("scan", "not_seen", "told"),
+    [(0, [], "removed"), (0, [1], "not_seen"), (1, [], "added"), (1, [0], "discovered")],
+)
+def test_whatever_one_scan_alone_has_is_told_with_its_probability(scan, not_seen, told):
+    o = new_object(1, scan, Instance(id=1, points=BOX), CODE)
+    unseen = {k: (o.id,) for k in not_seen}
+    changes = changes_between([o], 0, 1, CONFIG, {o.id: 0.7, "another": 0.1}, unseen)
+    assert getattr(changes, told) == (o.id,)
+    assert changes.probability == {o.id: 0.7}
+
+
 # --- what stands where it stood, without a mask ---------------------------------------------------------------------
 
 
