@@ -112,6 +112,7 @@ def test_results_name_command_data_and_hardware(options):
         report.main((options.data,), page)
 
 
+@pytest.mark.slow
 def test_fixed_batches_give_what_single_calls_give(tiny_prior):
     scene = known_scene(scans=2, points=300)
     clouds = [i.points for s in scene.scans for i in s.instances]

@@ -164,6 +164,7 @@ def test_both_modes_take_either_cloud(tiny_prior, clouds, method, moved):
     assert (value.shape, forward.shape, gradient.shape) == ((), (), cloud.shape)
 
 
+@pytest.mark.slow
 def test_gradients_through_the_encoder_reach_surface_registration(tiny_prior, clouds):
     source, target = (jnp.asarray(x, jnp.float32) for x in clouds)
     gradient = jax.jit(jax.grad(loss_with(SURFACE, start(10.0))))(source, target, tiny_prior)

@@ -30,13 +30,10 @@ POINTS = 512  # of every cloud registered by surfaces here: compiled once a prio
 # Fewer points than the preset: the clouds are clean, and what is tested is the same.
 SURFACE = SurfaceRegistration(search=SurfaceSearch(points=64, dense=256, cells=16, keep=4))
 PAPER = DescentRegistration(points=64, sdf_points=64, steps=5, icp_steps=3)
-# Random weights any way up, shipped weights upright.
+# Random weights any way up, shipped weights upright (the demo registers with them as well).
 CASES = [
     ("tiny", "free"),
-    *[
-        pytest.param(name, "upright", marks=[pytest.mark.slow] * (name != "small"))
-        for name in shipped_priors()
-    ],
+    *[pytest.param(name, "upright", marks=pytest.mark.slow) for name in shipped_priors()],
 ]
 
 

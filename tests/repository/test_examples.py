@@ -92,6 +92,7 @@ def test_a_hundred_pairs_are_registered(printed):
     assert number_after("share below 5°:", printed(4)) > 0.7
 
 
+@pytest.mark.slow
 def test_a_mesh_from_one_view_is_closed_and_its_verdict_follows_from_its_figures(printed):
     text = printed(5)
     by_view = number_after("unseen surface to the nearest seen point:", text)
