@@ -68,6 +68,7 @@ def test_all_that_is_said_of_changes_has_a_probability(scene):
     for c in scene.changes:
         assert set(c.probability) == {*c.static, *c.moved, *c.added, *c.removed}
         assert all(0.5 < p <= 1 for p in c.probability.values())
+    assert not any(seen.interchangeable for o in scene.objects for seen in o.observations)
     # One thing went and another came, of three; where one comes back, it is by its match that it is told.
     first, second = scene.changes
     assert [first.probability[i] for i in (*first.added, *first.removed)] == pytest.approx(

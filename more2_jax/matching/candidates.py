@@ -166,7 +166,7 @@ def align_proposed(
     T_scene_scan: Pose,
     seen: Seen | None = None,
 ) -> AlignedPairs:
-    """Aligns the pairs `worth` it of `clouds`: objects (scene's frame) and instances (scan's frame), one at least.
+    """Aligns the pairs in `worth` of `clouds`: objects (scene's frame) and instances (scan's frame), one each at least.
 
     `T_scene_scan`, `seen` and errors as in `align_candidates`.
     """

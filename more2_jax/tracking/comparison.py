@@ -103,9 +103,9 @@ class Comparison:
         *,
         halves: bool = False,
     ) -> dict[tuple[int, int], float]:
-        """Log odds of clouds of both scans that were not compared, by rows of `old` and `new`; of pairs `among` some.
+        """Log odds of clouds of both scans that were not compared, by rows of `old` and `new`.
 
-        Those of halves are small without being what people carry about.
+        `among`: the pairs to ask about, all by default. Halves are small without being what people carry about.
         """
         old, new = list(old), list(new)
         worth = self.proposed_others(old, new)
