@@ -24,19 +24,6 @@ install_import_hook(checked_modules(), "beartype.beartype")
 # One browser for all tests of the page; after the hook, for it imports more2_jax.
 from page_browser import browser, common, opened, opener, report, said  # noqa: E402, F401
 
-# Tests of these folders mostly trace programs, which counting slows by two thirds (Python 3.11), or are of what is not
-# counted. Scenes run most of the same lines: coverage is at least what the other tests reach.
-NOT_COUNTED = ("registration", "refinement", "network", "matching", "eval")  # folders,
-NOR_THESE = (  # and files of others
-    "test_device_meshes",
-    "test_device_steps",
-    "test_transformations",
-    "test_point_to_plane",
-    "test_both_decoders",
-    "test_decoder_alone",
-    "test_training",
-    "test_widen",
-)
 MOST_MAPS = 20_000  # two files of tests add no more than another 30,000
 
 
@@ -53,10 +40,7 @@ def tiny_prior():
 
 
 def pytest_collection_modifyitems(items):
-    """Marks what coverage leaves out, and lets what takes longest begin: no worker waits for it at the end."""
-    for item in items:
-        if item.path.parent.name in NOT_COUNTED or item.path.stem in NOR_THESE:
-            item.add_marker("no_cover")
+    """Lets what takes longest begin: no worker waits for it at the end."""
     items.sort(key=lambda item: item.get_closest_marker("begins") is None)
 
 

@@ -12,7 +12,7 @@ from more2_jax.network import prior as network_prior
 from more2_jax.registration import search, surface
 from more2_jax.scene import add_scan, reconstruct, run_scenes, start_scene
 
-pytestmark = [pytest.mark.optimized, pytest.mark.no_cover]
+pytestmark = pytest.mark.optimized
 
 SCENES = (
     # Two stay or move, one comes; one object alone; none of the second scan is known.

@@ -26,8 +26,6 @@ from more2_jax.network.prior import encode_ordered
 from more2_jax.refinement.joint import Observations
 from more2_jax.refinement.pose_graph import OrientedObservations, optimize_pose_graphs
 
-pytestmark = pytest.mark.no_cover
-
 ROWS, REAL, OBJECTS, SEEN = 256, 200, 3, 2
 MASK = np.arange(ROWS) < np.full((OBJECTS, 1), REAL)  # closed over
 DESCENT = DescentRegistration(points=32, sdf_points=32, steps=2, icp_steps=2)

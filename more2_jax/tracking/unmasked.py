@@ -8,7 +8,7 @@ background.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -70,8 +70,9 @@ def add_unmasked(
     gone, new = sorted(compared.identified.gone), sorted(compared.identified.new)
     free = things(scan.background, [i.points for i in whole.instances]) if gone else []
     instances = explained(compared, [compared.old[k] for k in gone], free, instances=True)
-    background, *masks = clouds_of(whole.objects, scans[-1]) if new else [scan.background[:0]]
-    before = explained(compared, [compared.new[i] for i in new], things(background, masks), instances=False)
+    seen = clouds_of(whole.objects, scans[-1]) if new else iter([scan.background[:0]])
+    free = things(next(seen), seen)
+    before = explained(compared, [compared.new[i] for i in new], free, instances=False)
     if not instances and not before:
         return None
     first = 1 + max((i.id for i in scan.instances), default=0)
@@ -132,14 +133,13 @@ def without_unfound(whole: Regrouped, compared: Comparison) -> Regrouped | None:
     )
 
 
-def things(background: Points, masks: Sequence[Points]) -> list[Thing]:
-    """Clusters of what is neither floor nor wall, nor lies on a mask."""
+def things(background: Points, masks: Iterable[Points]) -> list[Thing]:
+    """Clusters of what is neither floor nor wall, nor lies on a mask. Masks are let go of one by one."""
     if len(background) < LEAST_BACKGROUND:
         return []
     background = background[:: -(-len(background) // MOST_POINTS)]
     off = np.full(len(background), np.inf)
-    if masks:
-        few = [m[:: -(-len(m) // MASK_POINTS)] for m in masks if len(m)]
+    if few := [m[:: -(-len(m) // MASK_POINTS)].copy() for m in masks if len(m)]:
         off = KDTree(np.concatenate(few)).query(background, distance_upper_bound=REST_M)[0]
     free, off, config = background[off > BESIDE_M], off[off > BESIDE_M], SegmentationConfig()
     if not len(free) or np.ptp(free, axis=0).max() > config.voxel_m * LARGEST_GRID:

@@ -140,7 +140,6 @@ def test_every_block_of_the_page_is_run_here():
     assert {script_with(words) for words in (*SOURCES, WITH_MASKS, LATER)} == set(SCRIPTS)
 
 
-@pytest.mark.no_cover
 @pytest.mark.parametrize(
     "words", [pytest.param(w, marks=[] if w in QUICK else [pytest.mark.slow]) for w in SOURCES]
 )
@@ -157,7 +156,6 @@ def test_the_commands_of_a_source_make_a_scene(words, follow, quickly, tmp_path)
 
 
 @pytest.mark.slow
-@pytest.mark.no_cover
 def test_a_scan_is_added_and_the_scene_exported(follow, quickly, tmp_path):
     labeled_ply(tmp_path)
     follow(script_with(WITH_MASKS))
@@ -265,7 +263,6 @@ BATCHES = [
 
 
 @pytest.mark.slow
-@pytest.mark.no_cover
 def test_a_table_of_scenes_is_built(follow, quickly, tmp_path, monkeypatch, capsys):
     """By both commands of the guide, here by this process in place of workers and actors."""
     asked: list[tuple[int | None, str | None]] = []

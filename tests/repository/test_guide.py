@@ -55,7 +55,6 @@ WITH_PYTHON = [p for p in PAGES if p.name not in RUN_ELSEWHERE and "python" in d
 README = ROOT / "README.md"
 
 
-@pytest.mark.no_cover
 @pytest.mark.parametrize("page", WITH_PYTHON, ids=named)
 def test_the_python_of_a_page_runs_and_prints_what_it_says(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)

@@ -21,8 +21,6 @@ from train.run.validation import validate
 from train.shards.losses import total_loss
 from train.shards.sampling import sample_batch
 
-pytestmark = pytest.mark.no_cover
-
 
 @pytest.fixture(scope="module")
 def training():

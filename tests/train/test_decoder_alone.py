@@ -20,8 +20,6 @@ from train.run.start import looking_up_more, started_warm
 from train.run.state import initial_state, training_step
 from train.shards.sampling import sample_batch
 
-pytestmark = pytest.mark.no_cover
-
 
 @pytest.fixture(scope="module")
 def training():

@@ -21,8 +21,6 @@ from train.shards.fusion_flaws import (
 from train.shards.sampling import partial_cloud
 from train.shards.view_directions import VIEWS
 
-pytestmark = pytest.mark.no_cover
-
 KEYS = jax.random.split(jax.random.key(3), 100)
 CONFIG = TrainingConfig(queries=64, raw_points=256)
 POINTS = jax.random.uniform(jax.random.key(1), (600, 3), minval=-0.45, maxval=0.45)

@@ -29,8 +29,6 @@ from train.shards.sampling import partial_cloud, sample_batch
 from train.shards.shards import Shapes
 from train.shards.view_directions import DISTANCE, HALF_FIELD, view_directions
 
-pytestmark = pytest.mark.no_cover
-
 KEYS = jax.random.split(jax.random.key(0), 200)
 CLOUD = jax.random.uniform(jax.random.key(1), (500, 3), minval=-0.45, maxval=0.45)
 CONFIG = TrainingConfig(queries=64, raw_points=200, max_views=4)
