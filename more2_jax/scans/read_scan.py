@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float, Integer
@@ -16,6 +16,8 @@ from more2_jax.scans.labeled_cloud import CUT_WITHOUT, LabeledCloud, ReadOptions
 from more2_jax.scans.large_instances import thinned_instances
 from more2_jax.scans.normal_sides import outward
 from more2_jax.scans.predicted_masks import lay_masks
+from more2_jax.scans.structural_labels import drop_background, is_structure
+from more2_jax.scans.structural_shapes import drop_structure
 from more2_jax.types import Instance, Scan, Skipped
 
 UNITS_M = {"m": 1.0, "cm": 0.01, "mm": 0.001}
@@ -199,9 +201,14 @@ def scan_of(path: Path, cloud: LabeledCloud, unit: str, min_points: int) -> Scan
     coarse = _rounded(path, cloud.points, unit)
     points = cloud.points * UNITS_M[unit]
     sensors = np.zeros((0, 3)) if cloud.sensors is None else cloud.sensors
-    background = points[cloud.instance <= 0]
-    normals, turned = _outward_normals(cloud, cloud.instance, sensors)
-    whole, skipped = _instances(replace(cloud, normals=normals), cloud.instance, points, min_points)
+    labels = _labels(cloud, cloud.instance)
+    instance, named = drop_background(
+        cloud.instance, {i: x for i, x in labels.items() if i > 0 and is_structure(x)}
+    )
+    instance, shaped = drop_structure(points, instance, labels)
+    background = points[instance <= 0]
+    normals, turned = _outward_normals(cloud, instance, sensors)
+    whole, skipped = _instances(replace(cloud, normals=normals, labels=labels), instance, points, min_points)
     kept, thinned = thinned_instances(whole)
     if not kept:
         raise ValueError(f"{path}: no instances left; {_why_none(len(background), skipped, min_points)}")
@@ -211,7 +218,7 @@ def scan_of(path: Path, cloud: LabeledCloud, unit: str, min_points: int) -> Scan
         instances=kept,
         background=background,
         sensors=sensors * UNITS_M[unit],
-        skipped=(*cloud.skipped, *skipped),
+        skipped=(*cloud.skipped, *named, *shaped, *skipped),
         warnings=(*cloud.warnings, *coarse, *turned, *thinned, *_unit_warnings(kept, unit)),
     )
 
@@ -267,19 +274,26 @@ def _instances(
             continue
         colors = None if cloud.colors is None else cloud.colors[rows]
         normals = None if cloud.normals is None else cloud.normals[rows]
-        label = _label(cloud, index, rows)
+        label = cloud.labels.get(index)
         kept.append(Instance(id=index, points=points[rows], label=label, colors=colors, normals=normals))
     return tuple(kept), tuple(skipped)
 
 
-def _label(cloud: LabeledCloud, index: int, rows: np.ndarray) -> str | None:
-    """What most of the instance's points say; the first in order where two say it equally often."""
+def _labels(cloud: LabeledCloud, instance: Integer[np.ndarray, " n"]) -> dict[int, str]:
+    """By instance, what most of its points say; the first in order where two say it equally often."""
     if cloud.point_labels is None:
-        return cloud.labels.get(index)
-    values, counts = np.unique(cloud.point_labels[rows], return_counts=True)
-    most = values[np.argmax(counts)]
-    text = most.decode("utf-8", "replace") if isinstance(most, bytes) else str(most)
-    return text or None
+        return cloud.labels
+    labels, name = np.unique(cloud.point_labels, return_inverse=True)
+    pairs, counts = np.unique(np.stack([instance, name]), axis=1, return_counts=True)
+    best = np.lexsort((pairs[1], -counts, pairs[0]))
+    ids, first = np.unique(pairs[0, best], return_index=True)
+    texts = (_text(labels[k]) for k in pairs[1, best[first]])
+    return {i: text for i, text in zip(ids.tolist(), texts, strict=True) if text}
+
+
+def _text(label: Any) -> str:
+    """A label as text."""
+    return label.decode("utf-8", "replace") if isinstance(label, bytes) else str(label)
 
 
 def _why_none(background: int, skipped: tuple[Skipped, ...], min_points: int) -> str:

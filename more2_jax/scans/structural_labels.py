@@ -34,6 +34,11 @@ def is_background(label: str | None) -> bool:
     return label is not None and normalized(label) in BACKGROUND_LABELS
 
 
+def is_structure(label: str) -> bool:
+    """Whether the label names a part of the room."""
+    return normalized(label) in STRUCTURE
+
+
 def drop_background(
     instance: Integer[np.ndarray, "n"], labels: dict[int, str]
 ) -> tuple[Integer[np.ndarray, "n"], tuple[Skipped, ...]]:

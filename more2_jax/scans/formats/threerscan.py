@@ -98,7 +98,7 @@ def _labels(
     """Labels by object, objects without vertices, and a warning where the file is missing."""
     file = _first(folder, LABELS)
     if file is None:
-        return {}, (), (f"no {LABELS[0]}: labels are unknown, and walls and floors are kept as instances",)
+        return {}, (), (f"no {LABELS[0]}: labels are unknown, and walls and floors are told by their shape",)
     labels = {group.id: group.label for group in read_groups(file, segments=False) if group.label}
     present = set(np.unique(instance).tolist())
     empty = (i for i in sorted(labels) if i not in present)
