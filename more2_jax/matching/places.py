@@ -17,7 +17,7 @@ from more2_jax.geometry.poses import Points, Pose, apply_pose
 from more2_jax.matching.assignment import FARTHEST_M
 from more2_jax.matching.calibration import Compared
 from more2_jax.matching.candidates import AlignedPairs, aligned_pairs
-from more2_jax.matching.metric_evidence import MetricEvidence
+from more2_jax.matching.metric_evidence import APART_M, MetricEvidence, Seen
 from more2_jax.matching.proposals import Proposed, signatures
 from more2_jax.network.prior import Prior
 
@@ -27,6 +27,14 @@ OTHER_COLOR = -1.0  # log likelihood ratio: what has less is of another color
 # Of what a meter costs, in any orientation: without heights right pairs are less sure of one another, and four meters
 # outvoted them (docs/developing/notebook/places.md).
 FREE_SHARE = 0.25
+# Two things are not in one place: of a pair so near each other, in meters and in radii of the larger one, that this
+# share of one lies on the other, the log odds are so much beyond an even chance. What one scan saw a sliver of is
+# unlike the whole (docs/developing/notebook/perfect_masks.md).
+IN_PLACE_M, IN_PLACE_RADII, IN_PLACE_SHARE = 0.04, 0.1, 0.9
+IN_PLACE = 3.0
+MOST_EMPTY = (
+    2 / 3
+)  # of one: where the other scan shows more of it to be empty, its mask holds something else, too
 BY_PAIR = ("rows", "T_old_new", "top_gap_m", "off", "off_own")  # arrays of `AlignedPairs`
 BESIDE_M = 0.6  # centers of an object and of what a damaged mask shows of it, where it was
 
@@ -56,6 +64,34 @@ def stayed(aligned: AlignedPairs, T_scene_scan: Pose) -> Bool[np.ndarray, " p"]:
     as_turned = cosine > np.cos(np.deg2rad(STAYED_DEG))
     here = ((apart_m < STAYED_M) & as_turned | (apart_m < STAYED_TURNED_M)).any(axis=1)
     return here & (aligned.compared.color > OTHER_COLOR)
+
+
+def in_place(
+    aligned: AlignedPairs, rows: Bool[np.ndarray, " p"], T_scene_scan: Pose
+) -> Bool[np.ndarray, " p"]:
+    """Which of these pairs lie on each other, or one of them on the other, where nothing moved."""
+    here = np.zeros(len(rows), bool)
+    for n in np.flatnonzero(rows & (aligned.compared.color > OTHER_COLOR)):
+        old, new = (aligned.sides[1 - way][aligned.rows[n, way]].points for way in (0, 1))
+        on = lie_on(old, apply_pose(T_scene_scan, new))
+        here[n] = on >= IN_PLACE_SHARE and shown_empty(aligned.seen, old, new, T_scene_scan) <= MOST_EMPTY
+    return here
+
+
+def shown_empty(seen: Seen | None, old: Points, new: Points, T_scene_scan: Pose) -> float:
+    """Share of a cloud where the other scan saw past its place and found nothing, the larger of both; 0 if unknown."""
+    if seen is None:
+        return 0.0
+    there = apply_pose(T_scene_scan, new), apply_pose(np.linalg.inv(T_scene_scan), old)
+    return max(float(space.empty(p, APART_M).mean()) for space, p in zip(seen, there, strict=True))
+
+
+def lie_on(one: Points, other: Points) -> float:
+    """Share of a cloud that lies on another one: of the one of which more does."""
+    radius = max(float(np.sqrt(p.var(axis=0).sum())) for p in (one, other))
+    near_m = min(IN_PLACE_M, IN_PLACE_RADII * radius)
+    ways = ((one, other), (other, one))
+    return max(float(np.isfinite(KDTree(b).query(a, distance_upper_bound=near_m)[0]).mean()) for a, b in ways)
 
 
 def centers(aligned: AlignedPairs, T_scene_scan: Pose) -> tuple[Points, Points]:

@@ -9,10 +9,10 @@ import numpy as np
 
 from more2_jax.config import CodeMatcher, EvidenceMatcher, SceneConfig
 from more2_jax.matching.assignment import Chosen, LogOdds, assign, interchangeable, unmatched
-from more2_jax.matching.calibration import alone_probability, probability
+from more2_jax.matching.calibration import alone_probability, even_odds, probability
 from more2_jax.matching.candidates import AlignedPairs, odds_of
 from more2_jax.matching.code_assignment import match_instances
-from more2_jax.matching.places import motion_odds
+from more2_jax.matching.places import IN_PLACE, in_place, motion_odds
 from more2_jax.network.embedding_batch import stack
 from more2_jax.network.prior import Prior
 from more2_jax.tracking.objects import SCENE_FRAME
@@ -96,16 +96,23 @@ def by_evidence(
 
 
 def with_left_over(identified: Identified, config: SceneConfig) -> Identified:
-    """In any orientation: the same with pairs of what was left over that are nearly as likely one object as not.
+    """The same with pairs of what was left over that lie in one place.
 
-    To be asked when masks are mended: until then, what is left over shows which masks to mend.
+    In any orientation also those that are nearly as likely one object as not. To be asked when masks are mended: until
+    then, what is left over shows which masks to mend.
     """
     aligned, frame = identified.aligned, identified.frame
-    if aligned is None or config.motion != "free" or not isinstance(config.matching, EvidenceMatcher):
+    if aligned is None or not isinstance(config.matching, EvidenceMatcher):
         return identified
-    odds = odds_of(aligned, config.matching.search, config.motion)
+    search, upright = config.matching.search, config.motion == "upright"
+    height_m = float(frame.T_scene_scan[2, 3]) if upright else 0.0
+    odds = odds_of(aligned, search, config.motion, height_m)
     k, i = odds.pairs.T
     rows = np.isin(k, list(identified.gone)) & np.isin(i, list(identified.new))
+    here = in_place(aligned, rows & (not frame.unknown), frame.T_scene_scan)
+    sure = np.maximum(odds.value, even_odds(search, config.motion) + IN_PLACE)
+    odds = replace(odds, value=np.where(here, sure, odds.value))
+    rows = here if upright else rows
     left = LogOdds(pairs=odds.pairs[rows], value=odds.value[rows] + LEFT_OVER, shape=odds.shape)
     motion = motion_odds(aligned, frame.T_scene_scan, config.matching, config.motion)
     more = assign(left, motion[rows])

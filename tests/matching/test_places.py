@@ -11,8 +11,18 @@ from more2_jax.geometry.poses import apply_pose
 from more2_jax.matching.assignment import assign, interchangeable
 from more2_jax.matching.calibration import CARRIED, UPRIGHT, Compared, log_odds
 from more2_jax.matching.candidates import PORTABLE_M, align_candidates, odds_of, portable
+from more2_jax.matching.metric_evidence import seen_in
 from more2_jax.matching.pair_evidence import PairEvidence
-from more2_jax.matching.places import BESIDE_M, FREE_SHARE, OTHER_COLOR, motion_odds, stayed, with_neighbors
+from more2_jax.matching.places import (
+    BESIDE_M,
+    FREE_SHARE,
+    OTHER_COLOR,
+    in_place,
+    lie_on,
+    motion_odds,
+    stayed,
+    with_neighbors,
+)
 from more2_jax.network.embedding_batch import embed
 from more2_jax.types import ObservedObject
 
@@ -21,10 +31,10 @@ SIZES = [np.array(s) for s in ([1.0, 0.5, 0.6], [0.5, 0.6, 1.0], [1.4, 0.4, 0.3]
 SHIFT = np.array([[0.0, 0, 0], [0, 0, 0], [1.5, 0.8, 0]])  # the third moved
 
 
-def cloud(rng, size, turn_deg=0.0):
+def cloud(rng, size, turn_deg=0.0, count=500):
     """A box with a ridge along one edge, so that no turn leaves it as it is; standing on z = 0."""
-    points = rng.uniform(-0.5, 0.5, (500, 3))
-    points[np.arange(500), rng.integers(0, 3, 500)] = rng.choice([-0.5, 0.5], 500)
+    points = rng.uniform(-0.5, 0.5, (count, 3))
+    points[np.arange(count), rng.integers(0, 3, count)] = rng.choice([-0.5, 0.5], count)
     ridge = rng.uniform(-0.5, 0.5, (150, 3)) * [0.3, 0.2, 0.5] + [0.35, 0.3, 0.75]
     points = np.concatenate([points, ridge]) * size + [0, 0, size[2] / 2]
     c, s = np.cos(np.deg2rad(turn_deg)), np.sin(np.deg2rad(turn_deg))
@@ -147,3 +157,57 @@ def test_heights_say_little_of_what_is_small():
     same, large, small = log_odds(evidence, known, UPRIGHT)
     assert same - large == pytest.approx(-(UPRIGHT.lift + UPRIGHT.top))
     assert same - small == pytest.approx((1 - CARRIED) * (same - large))
+
+
+def sliver(points):
+    """What a scan sees of a thing from far aside."""
+    return points[points[:, 0] <= np.quantile(points[:, 0], 0.15)]
+
+
+def lying(aligned, T):
+    rows = in_place(aligned, np.ones(len(aligned.rows), bool), T)
+    return {tuple(r) for r in aligned.rows[rows].tolist()}
+
+
+def test_a_sliver_lies_on_what_it_is_of_whichever_scan_saw_it(tiny_prior):
+    rng = np.random.default_rng(2)
+    first = [cloud(rng, size, count=4000) + [3.0 * k, 0, 0] for k, size in enumerate(SIZES)]
+    second = [cloud(rng, size, count=4000) + [3.0 * k, 0, 0] + SHIFT[k] for k, size in enumerate(SIZES)]
+    T = np.eye(4)
+    T[:2, :2] = [[0, -1], [1, 0]]
+    T[:3, 3] = [5.0, -2.0, 0.0]
+    seen = [apply_pose(np.linalg.inv(T), c) for c in (sliver(second[0]), second[1], sliver(second[2]))]
+    aligned = aligned_at(tiny_prior, [first[0], sliver(first[1]), first[2]], seen, T)
+    assert {(0, 0), (1, 1)} <= {tuple(r) for r in aligned.rows.tolist()}
+    assert lying(aligned, T) == {(0, 0), (1, 1)}  # the third moved
+    assert lying(aligned, np.eye(4)) == set()
+    other = dataclasses.replace(aligned.compared, color=np.full(len(aligned.rows), OTHER_COLOR - 1))
+    assert lying(dataclasses.replace(aligned, compared=other), T) == set()
+    none = in_place(aligned, np.zeros(len(aligned.rows), bool), T)
+    assert not none.any()
+
+
+def test_lying_on_each_other_has_no_direction_and_a_scale_that_of_the_larger():
+    rng = np.random.default_rng(0)
+    whole = cloud(rng, SIZES[0], count=4000)
+    part, beside = sliver(whole), whole + [0.0, 0.0, 0.5]
+    assert lie_on(part, whole) == lie_on(whole, part) == 1.0
+    assert lie_on(whole, beside) == lie_on(beside, whole) < 0.5
+    assert lie_on(part, part[:1]) == 1.0  # a point alone
+    cup, other_cup = 0.05 * whole, 0.05 * cloud(rng, SIZES[1], count=4000)
+    assert lie_on(cup, other_cup) < 0.9  # though all of it is within centimeters
+    assert lie_on(20.0 * cup, 20.0 * other_cup) == pytest.approx(lie_on(cup, other_cup), abs=0.1)
+
+
+@pytest.mark.parametrize(("floor_to", "one_object"), [(0.2, True), (1.0, False)])
+def test_a_part_is_no_sliver_where_the_scan_saw_past_the_rest(tiny_prior, floor_to, one_object):
+    whole = [cloud(np.random.default_rng(k), SIZES[0], count=4000) + [0, 0, 0.2] for k in range(2)]
+    steps = np.arange(-0.6, 0.6, 0.03)
+    floor = np.stack([*np.meshgrid(steps, steps), np.zeros((len(steps),) * 2)], axis=-1).reshape(-1, 3)
+    looked_at = floor[floor[:, 0] < np.quantile(floor[:, 0], floor_to)]
+    sides = observed(tiny_prior, whole[:1]), observed(tiny_prior, [sliver(whole[1])])
+    seen = seen_in(*sides, scan=looked_at)
+    aligned = align_candidates(tiny_prior, *sides, MATCHER, "upright", seen=seen)
+    assert lying(aligned, np.eye(4)) == ({(0, 0)} if one_object else set())
+    unseen = dataclasses.replace(aligned, seen=None)
+    assert lying(unseen, np.eye(4)) == {(0, 0)}

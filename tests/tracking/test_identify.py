@@ -1,4 +1,4 @@
-"""Who is who among what is left over, in any orientation."""
+"""Who is who among what is left over: what lies in one place, and in any orientation what is nearly as likely."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from more2_jax.matching.assignment import LogOdds
 from more2_jax.matching.candidates import AlignedPairs
 from more2_jax.tracking import identify
 from more2_jax.tracking.identify import LEFT_OVER, Found, Identified, with_left_over
+from more2_jax.types import Frame
 
 FREE, UPRIGHT = preset("robust", upright=False), preset("robust", upright=True)
 
@@ -25,8 +26,13 @@ KNOWN = Identified(
 )
 
 
-def told(monkeypatch: pytest.MonkeyPatch, matrix: list[list[float]], config=FREE, known=KNOWN) -> Identified:
-    monkeypatch.setattr(identify, "odds_of", lambda *_: LogOdds.of(np.array(matrix, float)))
+def told(
+    monkeypatch: pytest.MonkeyPatch, matrix: list[list[float]], config=FREE, known=KNOWN, here=()
+) -> Identified:
+    odds = LogOdds.of(np.array(matrix, float))
+    lie_there = np.array([tuple(pair) in here for pair in odds.pairs.tolist()])
+    monkeypatch.setattr(identify, "odds_of", lambda *_: odds)
+    monkeypatch.setattr(identify, "in_place", lambda _, rows, __: rows & lie_there)
     monkeypatch.setattr(identify, "motion_odds", lambda *_: np.zeros(9))
     return with_left_over(known, config)
 
@@ -60,3 +66,22 @@ def test_upright_and_without_surfaces_nothing_changes(monkeypatch):
     assert told(monkeypatch, likely, UPRIGHT) is KNOWN
     by_codes = dataclasses.replace(KNOWN, aligned=None)
     assert told(monkeypatch, likely, FREE, by_codes) is by_codes
+
+
+@pytest.mark.parametrize("config", [FREE, UPRIGHT])
+def test_what_lies_in_one_place_is_one_object_however_unlike(monkeypatch, config):
+    unlikely = [[-9, 3, -9], [-9, -9, -9], [-9, -9, -8]]
+    found = told(monkeypatch, unlikely, config, here={(1, 2)})
+    assert pairs(found) == [(0, 1), (1, 2)]
+    assert set(found.gone) == {2} and set(found.new) == {0}
+    assert found.found[1].score > 0.9
+
+
+@pytest.mark.parametrize("config", [FREE, UPRIGHT])
+def test_what_was_found_is_not_taken_from_what_lies_in_its_place(monkeypatch, config):
+    assert told(monkeypatch, [[-9, 3, -9]] * 3, config, here={(1, 1), (0, 0)}) is KNOWN
+
+
+def test_where_nothing_tells_how_a_scan_lies_places_say_nothing(monkeypatch):
+    lost = dataclasses.replace(KNOWN, frame=Frame(unknown=True))
+    assert told(monkeypatch, [[-9, 3, -9]] * 3, UPRIGHT, lost, here={(1, 2)}) is lost
