@@ -32,9 +32,8 @@ FREE_SHARE = 0.25
 # unlike the whole (docs/developing/notebook/perfect_masks.md).
 IN_PLACE_M, IN_PLACE_RADII, IN_PLACE_SHARE = 0.04, 0.1, 0.9
 IN_PLACE = 3.0
-MOST_EMPTY = (
-    2 / 3
-)  # of one: where the other scan shows more of it to be empty, its mask holds something else, too
+# Where the other scan shows more of one to be empty, its mask holds something else, too.
+MOST_EMPTY = 2 / 3
 BY_PAIR = ("rows", "T_old_new", "top_gap_m", "off", "off_own")  # arrays of `AlignedPairs`
 BESIDE_M = 0.6  # centers of an object and of what a damaged mask shows of it, where it was
 

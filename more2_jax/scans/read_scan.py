@@ -284,10 +284,11 @@ def _labels(cloud: LabeledCloud, instance: Integer[np.ndarray, " n"]) -> dict[in
     if cloud.point_labels is None:
         return cloud.labels
     labels, name = np.unique(cloud.point_labels, return_inverse=True)
-    pairs, counts = np.unique(np.stack([instance, name]), axis=1, return_counts=True)
-    best = np.lexsort((pairs[1], -counts, pairs[0]))
-    ids, first = np.unique(pairs[0, best], return_index=True)
-    texts = (_text(labels[k]) for k in pairs[1, best[first]])
+    ids, which = np.unique(instance, return_inverse=True)
+    pairs, counts = np.unique(which * len(labels) + name, return_counts=True)
+    which, name = np.divmod(pairs, len(labels))
+    best = np.lexsort((name, -counts, which))
+    texts = (_text(labels[k]) for k in name[best[np.unique(which[best], return_index=True)[1]]])
     return {i: text for i, text in zip(ids.tolist(), texts, strict=True) if text}
 
 

@@ -61,15 +61,16 @@ def structural(points: Points, instance: Ids) -> list[int]:
     """Instances that lie on floors and walls, each having more of one of them than any other or the background."""
     config = SegmentationConfig()
     voxels, voxel_of = voxel_means(points, config.voxel_m)
+    ids, which = np.unique(np.maximum(instance, 0), return_inverse=True)
     owner = np.zeros(len(voxels), np.int64)
-    owner[voxel_of] = np.maximum(instance, 0)  # of several in a voxel, one
+    owner[voxel_of] = which  # of several in a voxel, one
     planes, _ = boundary_planes(voxels, voxel_normals(voxels, config.normal_neighbors), config)
     on = [on_plane(voxels, p, config) for p in planes if p.structure]
     if not on:
         return []
     most = {int(np.bincount(owner[rows]).argmax()) for rows in on}
     share = np.bincount(owner, np.any(on, axis=0)) / np.maximum(np.bincount(owner), 1)
-    return sorted(i for i in most if i > 0 and share[i] >= LEAST_SHARE)
+    return [int(ids[n]) for n in sorted(most) if ids[n] > 0 and share[n] >= LEAST_SHARE]
 
 
 def on_plane(voxels: Points, plane: Plane, config: SegmentationConfig) -> Bool[np.ndarray, " n"]:
