@@ -101,6 +101,17 @@ def test_npz_reads_back(tmp_path):
     np.testing.assert_allclose(scan.instances[1].colors / 255.0, rgb[IDS == 7], atol=1 / 255)
 
 
+@pytest.mark.parametrize("code", [0x110000, 0xFFFFFFFF, 0xD800, 0xDFFF])
+@pytest.mark.parametrize("order", "<>")
+def test_npz_labels_that_are_no_text_are_refused(tmp_path, code, order):
+    codes = np.full(len(POINTS), ord("a"), f"{order}u4")
+    np.savez(tmp_path / "s.npz", points=POINTS, instance=IDS, label=codes.view(f"{order}U1"))
+    assert {i.label for i in read_scan(tmp_path / "s.npz").instances} == {"a"}
+    codes[5] = code
+    np.savez(tmp_path / "s.npz", points=POINTS, instance=IDS, label=codes.view(f"{order}U1"))
+    assert "label holds what is no text" in fails(tmp_path / "s.npz")
+
+
 def test_npz_instance_property_names_another_array(tmp_path):
     np.savez(tmp_path / "s.npz", points=POINTS, segments=IDS)
     assert [i.id for i in read_scan(tmp_path / "s.npz", instance_property="segments").instances] == [3, 7]
