@@ -17,7 +17,7 @@ from more2_jax.scans.large_instances import thinned_instances
 from more2_jax.scans.normal_sides import outward
 from more2_jax.scans.predicted_masks import lay_masks
 from more2_jax.scans.structural_labels import drop_background, is_structure
-from more2_jax.scans.structural_shapes import drop_structure
+from more2_jax.scans.structural_shapes import drop_structure, warning
 from more2_jax.types import Instance, Scan, Skipped
 
 UNITS_M = {"m": 1.0, "cm": 0.01, "mm": 0.001}
@@ -219,7 +219,7 @@ def scan_of(path: Path, cloud: LabeledCloud, unit: str, min_points: int) -> Scan
         background=background,
         sensors=sensors * UNITS_M[unit],
         skipped=(*cloud.skipped, *named, *shaped, *skipped),
-        warnings=(*cloud.warnings, *coarse, *turned, *thinned, *_unit_warnings(kept, unit)),
+        warnings=(*cloud.warnings, *warning(shaped), *coarse, *turned, *thinned, *_unit_warnings(kept, unit)),
     )
 
 

@@ -16,7 +16,7 @@ from more2_jax.types import Skipped
 # Of an instance: as long as this share of the scan, and with so many of its voxels on floors and walls.
 LEAST_LENGTH, LEAST_SHARE = 0.4, 0.7
 FEWEST = 3  # masks in a scan: of one or two things alone nothing is the room
-REASON = "background: a floor, wall or ceiling by its shape; a label keeps what is none"
+REASON = "background: a floor, wall or ceiling by its shape"
 
 Points = Float[np.ndarray, "n 3"]
 Ids = Integer[np.ndarray, "n"]
@@ -34,6 +34,14 @@ def drop_structure(points: Points, instance: Ids, labels: dict[int, str]) -> tup
     dropped = [i for i in structural(points, instance) if i in long]
     said = tuple(Skipped(what=f"instance {i}", reason=REASON) for i in dropped)
     return np.where(np.isin(instance, dropped), 0, instance), said
+
+
+def warning(dropped: tuple[Skipped, ...]) -> tuple[str, ...]:
+    """What to say of those that were dropped, if any."""
+    if not dropped:
+        return ()
+    which = ", ".join(s.what for s in dropped)
+    return (f"taken for floor, wall or ceiling by shape: {which}; a label keeps what is none",)
 
 
 def long_instances(points: Points, instance: Ids, labels: dict[int, str]) -> set[int]:

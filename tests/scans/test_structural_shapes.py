@@ -100,6 +100,8 @@ def test_a_file_is_read_with_the_room_as_background(tmp_path):
     assert {i.id for i in scan.instances} == set(instance.tolist()) - ROOM
     assert len(scan.background) == np.isin(instance, list(ROOM)).sum()
     assert {s.what for s in scan.skipped} == {f"instance {i}" for i in ROOM}
+    (said,) = scan.warnings
+    assert all(f"instance {i}" in said for i in ROOM)
 
 
 def test_names_of_points_tell_the_room_too(tmp_path):
@@ -109,3 +111,4 @@ def test_names_of_points_tell_the_room_too(tmp_path):
     scan = read_scan(tmp_path / "room.npz")
     assert {i.id for i in scan.instances} == set(instance.tolist()) - {FLOOR, PICTURE}
     assert {s.what for s in scan.skipped} == {f"instance {FLOOR} (floor)", f"instance {PICTURE} (window)"}
+    assert not scan.warnings
