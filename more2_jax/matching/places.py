@@ -27,13 +27,15 @@ OTHER_COLOR = -1.0  # log likelihood ratio: what has less is of another color
 # Of what a meter costs, in any orientation: without heights right pairs are less sure of one another, and four meters
 # outvoted them (docs/developing/notebook/places.md).
 FREE_SHARE = 0.25
-# Two things are not in one place: of a pair so near each other, in meters and in radii of the larger one, that this
-# share of one lies on the other, the log odds are so much beyond an even chance. What one scan saw a sliver of is
-# unlike the whole (docs/developing/notebook/perfect_masks.md).
-IN_PLACE_M, IN_PLACE_RADII, IN_PLACE_SHARE = 0.04, 0.1, 0.9
-IN_PLACE = 3.0
-# Where the other scan shows more of one to be empty, its mask holds something else, too.
-MOST_EMPTY = 2 / 3
+# Two things are not in one place. A sliver is unlike the whole, but lies on it where nothing moved
+# (docs/developing/notebook/perfect_masks.md).
+IN_PLACE_M, IN_PLACE_RADII = (
+    0.04,
+    0.1,
+)  # a point so near the other cloud lies on it; radii are the larger cloud's
+IN_PLACE_SHARE = 0.9  # of one cloud: if so much lies on the other, both are in one place
+IN_PLACE = 3.0  # log odds of such a pair, beyond an even chance
+MOST_EMPTY = 2 / 3  # of a cloud, by the other scan: if more is empty, its mask holds something else, too
 BY_PAIR = ("rows", "T_old_new", "top_gap_m", "off", "off_own")  # arrays of `AlignedPairs`
 BESIDE_M = 0.6  # centers of an object and of what a damaged mask shows of it, where it was
 

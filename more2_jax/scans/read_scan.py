@@ -50,7 +50,8 @@ def read_scan(
     `object_id` or `label`, in this order; `instance_property` names another); an NPZ with `points` (n, 3), `instance`
     (n,) and optional `label` (n,), `color` or `colors` (n, 3), `normal` or `normals` (n, 3), `sensors` (s, 3); a folder
     of one PLY per object; or another format of `scans.formats.registry`. `<scan>.sensors.txt` beside it may hold the
-    positions of its sensors. Instance ids ≤ 0 are background. Normals are the file's, else those of its faces.
+    positions of its sensors. Instance ids ≤ 0 are background, and so are floors and walls, by their labels or, without,
+    by their shape (`structural_shapes`). Normals are the file's, else those of its faces.
 
     `unit` is the file's: m, cm or mm. `up` names the file's up axis (x, y, z, -x, -y, -z); the scan is turned so that
     it is z. `masks` are predicted ones (`scans.predicted_masks`): those scored `min_score` or more replace the scan's
