@@ -103,3 +103,8 @@ def ball_around(points: Points) -> tuple[Float[np.ndarray, "3"], float]:
         return np.zeros(3), -np.inf
     center = (points.min(axis=0) + points.max(axis=0)) / 2
     return center, float(np.linalg.norm(points - center, axis=1).max())
+
+
+def rms_radius(points: Points) -> float:
+    """Root of the mean squared distance from the mean, meters: how large a cloud is, whatever lies far from it."""
+    return float(np.sqrt(points.var(axis=0).sum()))

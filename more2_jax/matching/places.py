@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float
 from scipy.spatial import KDTree
 
 from more2_jax.config import EvidenceMatcher, MotionModel
+from more2_jax.geometry.near_points import rms_radius
 from more2_jax.geometry.poses import Points, Pose, apply_pose
 from more2_jax.matching.assignment import FARTHEST_M
 from more2_jax.matching.calibration import Compared
@@ -89,7 +90,7 @@ def shown_empty(seen: Seen | None, old: Points, new: Points, T_scene_scan: Pose)
 
 def lie_on(one: Points, other: Points) -> float:
     """Share of a cloud that lies on another one: of the one of which more does."""
-    radius = max(float(np.sqrt(p.var(axis=0).sum())) for p in (one, other))
+    radius = max(rms_radius(one), rms_radius(other))
     near_m = min(IN_PLACE_M, IN_PLACE_RADII * radius)
     ways = ((one, other), (other, one))
     return max(float(np.isfinite(KDTree(b).query(a, distance_upper_bound=near_m)[0]).mean()) for a, b in ways)

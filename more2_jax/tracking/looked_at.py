@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial import KDTree
 
-from more2_jax.geometry.near_points import NearPoints
+from more2_jax.geometry.near_points import NearPoints, rms_radius
 from more2_jax.geometry.poses import Points, apply_pose
 from more2_jax.tracking.objects import accumulated_points, observation_in, place_of, points_of
 from more2_jax.tracking.surroundings import around
@@ -170,6 +170,5 @@ class Columns:
 
 def looked_at(place: Points, room: KDTree) -> float:
     """Share of a place's points with a point of the scan nearer than its radius."""
-    radius = float(np.sqrt(((place - place.mean(axis=0)) ** 2).sum(axis=1).mean()))
-    distance, _ = room.query(place, distance_upper_bound=radius)
+    distance, _ = room.query(place, distance_upper_bound=rms_radius(place))
     return float(np.isfinite(distance).mean())

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial import KDTree
 
+from more2_jax.geometry.near_points import rms_radius
 from more2_jax.geometry.poses import Points, Pose, apply_pose
 from more2_jax.matching.color import pooled
 from more2_jax.tracking.objects import accumulated_points, all_normals, place_of
@@ -168,8 +169,7 @@ def share_on(whole: Points, part: Points) -> float:
 
 def reach_m(whole: Points) -> float:
     """So near its points lies what lies on a cloud."""
-    radius = float(np.sqrt(((whole - whole.mean(axis=0)) ** 2).sum(axis=1).mean()))
-    return max(NEAR * radius, NEAR_M)
+    return max(NEAR * rms_radius(whole), NEAR_M)
 
 
 def joined(first: Instance, others: Sequence[Instance]) -> Instance:

@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Bool
 from scipy.spatial import KDTree
 
+from more2_jax.geometry.near_points import rms_radius
 from more2_jax.geometry.poses import Points, apply_pose
 from more2_jax.geometry.segmentation import SegmentationConfig, segment_geometric
 from more2_jax.geometry.voxels import LARGEST_GRID
@@ -198,8 +199,8 @@ def parts_like(
 
 def near_to(whole: Points, points: Points) -> Bool[np.ndarray, " n"]:
     """Which points may be an object's, placed there, be they of sides that it has not shown."""
-    radius = float(np.sqrt(((whole - whole.mean(axis=0)) ** 2).sum(axis=1).mean()))
-    return np.isfinite(KDTree(whole).query(points, distance_upper_bound=REACH * radius)[0])
+    reach_m = REACH * rms_radius(whole)
+    return np.isfinite(KDTree(whole).query(points, distance_upper_bound=reach_m)[0])
 
 
 def odds_with(

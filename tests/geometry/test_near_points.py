@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from more2_jax.geometry.free_space import axes_toward
-from more2_jax.geometry.near_points import CELL_M, RADIUS_M, NearClouds, NearPoints
+from more2_jax.geometry.near_points import CELL_M, RADIUS_M, NearClouds, NearPoints, rms_radius
 
 POINTS = np.random.default_rng(0).uniform(-20, 20, (20_000, 3))
 
@@ -70,3 +70,11 @@ def test_clouds_near_some_places_show_there_what_all_clouds_show():
         everything = some.around_box(np.full(3, -1e3), np.full(3, 1e3))
         assert len(rest) <= len(everything) < 60 * 50 + len(rest)
     assert building.near(places, 8.0) is some
+
+
+def test_the_radius_of_a_cloud_is_that_of_a_ball_whose_surface_it_covers_wherever_it_lies():
+    points = np.random.default_rng(3).normal(size=(20_000, 3))
+    sphere = 0.7 * points / np.linalg.norm(points, axis=1, keepdims=True)
+    assert rms_radius(sphere) == pytest.approx(0.7, rel=1e-3)
+    assert rms_radius(sphere + 50) == pytest.approx(rms_radius(sphere), rel=1e-9)
+    assert rms_radius(np.full((5, 3), 2.0)) == 0

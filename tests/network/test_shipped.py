@@ -22,8 +22,8 @@ LARGEST_MB = 16  # of a file of weights
 PRIORS = shipped_priors()
 
 
-def test_small_is_shipped_in_a_file_that_is_not_too_large():
-    assert shipped_priors() == ["small"]
+def test_two_files_of_weights_are_shipped_and_neither_is_too_large():
+    assert shipped_priors() == ["small", "small_2"]
     folder = Path(str(resources.files("more2_jax"))) / "assets" / "weights"
     assert all(p.stat().st_size <= LARGEST_MB * 1_000_000 for p in folder.iterdir())
 
