@@ -70,6 +70,8 @@ def read_open(folder: Path) -> KnownScene:
         true_points=tuple(vertices_of(k, scan, objects) for k, scan in enumerate(scene.scans))
         if scene.regime == "real"
         else (),
+        looked_at=scene.looked_at,
+        looked_at_next=scene.looked_at_next,
     )
 
 

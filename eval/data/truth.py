@@ -64,6 +64,10 @@ class KnownScene:
     facts: dict[str, Any] = field(default_factory=dict)
     # By scan, the points that are really each object's, by its name; (): those of its masks. None: not known.
     true_points: tuple[dict[str, Points], ...] | None = ()
+    # By scan, the share within sight of the last place of each object, by its name, and of the place of what came by
+    # the next scan; (): not known.
+    looked_at: tuple[dict[str, float], ...] = ()
+    looked_at_next: tuple[dict[str, float], ...] = ()
 
     def true_masks(self) -> tuple[dict[str, Points], ...] | None:
         """By scan, the points that are really each object's, by its name; in the scan's frame, meters.
@@ -101,7 +105,17 @@ class KnownScene:
             scans=self.scans[:count],
             objects=tuple(o for o in objects if o.instance),
             true_points=self.true_points and self.true_points[:count],
+            looked_at=self.looked_at[:count],
+            looked_at_next=self.looked_at_next[:count],
         )
+
+    def in_sight(self, o: KnownObject, scan: int, there: int) -> float:
+        """Share of the place that an object has in scan `there`, one before or after, that `scan` looked at.
+
+        1 where that is not known.
+        """
+        shares = self.looked_at if there < scan else self.looked_at_next
+        return shares[scan].get(o.name, 1.0) if scan < len(shares) else 1.0
 
     def owner(self, scan: int, instance: int) -> KnownObject | None:
         """The object that an instance of a scan shows, be it the smaller part of a split one."""

@@ -103,6 +103,25 @@ def test_what_is_not_seen_has_neither_come_nor_gone(absent):
 
 
 @pytest.mark.parametrize("absent", [0, 1])
+@pytest.mark.parametrize(("share", "known"), [(0.0, False), (0.09, False), (0.11, True), (1.0, True)])
+def test_what_changed_where_the_other_scan_did_not_look_counts_neither_way(absent, share, known):
+    seen = {k: i for k, i in SCENE.objects[0].instance.items() if k != absent}
+    poses = {k: T for k, T in SCENE.objects[0].T_scan_model.items() if k != absent}
+    gone = with_object(SCENE, 0, instance=seen, T_scan_model=poses)
+    looked = {absent: {SCENE.objects[0].name: share}}
+    by_scan = tuple(looked.get(k, {}) for k in range(2))
+    which = "looked_at" if absent else "looked_at_next"  # what went, and what came
+    told = dataclasses.replace(gone, **{which: by_scan})
+    said, *others = true_tracks(told)
+    assert changes_f1(told, [said, *others]) == 1
+    assert changes_f1(told, others) == (0 if known else 1)
+    silent = dataclasses.replace(said, not_seen=frozenset({absent}))
+    assert changes_f1(told, [silent, *others]) == (0 if known else 1)
+    other = "looked_at_next" if absent else "looked_at"  # tells of another place
+    assert changes_f1(dataclasses.replace(gone, **{other: by_scan}), others) == 0
+
+
+@pytest.mark.parametrize("absent", [0, 1])
 @pytest.mark.parametrize("visible", [True, False])
 def test_what_is_told_of_a_thing_without_a_mask(absent, visible):
     first, *others = true_tracks(SCENE)

@@ -151,6 +151,22 @@ def test_what_is_gone_was_looked_at_and_what_is_skipped_was_not(monkeypatch):
     assert np.mean([room.looked_at[1][o.name] for o in gone]) > 0.5
 
 
+def test_where_something_came_the_scan_before_had_looked_unless_it_skipped_that_part(monkeypatch):
+    monkeypatch.setattr(
+        real_visits, "_roles", lambda *_: real_visits.FlyingConfig(scans=2, added=3, static=2)
+    )
+    shares = {}
+    for skipping in (0.0, 1.0):
+        monkeypatch.setattr(real_visits, "SKIPPING", skipping)
+        rooms = [made(seed=s) for s in (5, 6)]
+        for room in rooms:
+            came = {o.name for o in room.objects if set(o.T_scan_model) == {1}}
+            assert len(came) == 3
+            assert set(room.looked_at_next[0]) == came and room.looked_at_next[1] == {}
+        shares[skipping] = [share for room in rooms for share in room.looked_at_next[0].values()]
+    assert np.mean(shares[0.0]) > 0.5 > np.min(shares[1.0])
+
+
 def test_furniture_stands_apart_and_what_moves_moves():
     vertices = {m.name: m.vertices - [0, 0, m.vertices[:, 2].min()] for m in MODELS}
     rng = np.random.default_rng(0)

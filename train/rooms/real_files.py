@@ -3,7 +3,7 @@
 scene_0000/scan_0.ply            a mesh: vertices with normals, colors and `instance` (0: none), and faces
 scene_0000/scan_0.truth.npz      owner (v,): the true object of every vertex, −1 for none; object, T_scan_model, seen;
                                  T_scan_camera of every frame; T_scan_room
-scene_0000/scene.json            as in `scene_files`; and of every scan T_scan_room and looked_at
+scene_0000/scene.json            as in `scene_files`; and of every scan T_scan_room, looked_at, looked_at_next
 """
 
 from __future__ import annotations
@@ -75,6 +75,7 @@ def real_truth(scene: RealScene, facts: Mapping[str, Any], files: Mapping[str, s
             "file": f"scan_{k}.ply",
             "T_scan_room": scan.T_scan_room.tolist(),
             "looked_at": {n: round(share, 4) for n, share in scene.looked_at[k].items()},
+            "looked_at_next": {n: round(share, 4) for n, share in scene.looked_at_next[k].items()},
         }
         for k, scan in enumerate(scene.scans)
     ]

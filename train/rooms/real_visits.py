@@ -6,13 +6,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from train.furniture.collections import SourceMesh
 from train.rooms.arrangement import Circle, arrange, circle
 from train.rooms.coloring import face_colors, model_colors, palette
+from train.rooms.depth_sensor import DepthSensor, Frame
 from train.rooms.frames import Frames, scan_frames
 from train.rooms.furnishing import furnish
 from train.rooms.fused_scan import FusedScan, ScanSettings, fused_scan, take_frames
@@ -56,6 +57,8 @@ class RealScene:
     objects: tuple[TrueObject, ...]
     shown: tuple[dict[str, Shown], ...]  # a scan: how masks show the objects that it shows
     looked_at: tuple[dict[str, float], ...]  # a scan: share of each object's last place within sight
+    # A scan: the same of the places of what is there at the next visit and was not at this one.
+    looked_at_next: tuple[dict[str, float], ...]
     T_room_camera: tuple[np.ndarray, ...]  # a scan: (frames, 4, 4), true
     frames: Frames
     room_m: tuple[float, float]
@@ -71,6 +74,7 @@ class Visit:
     seen: dict[str, np.ndarray]
     looked_at: dict[str, float]
     path: np.ndarray
+    frames: Sequence[Frame]
 
     @property
     def poses(self) -> dict[str, Pose]:
@@ -99,18 +103,23 @@ def real_scene(
         config=config,
     )
     visits: list[Visit] = []
+    looked_at_next: list[dict[str, float]] = []
     last: dict[str, Pose] = {}  # where each object stood when it was there last
     for index in range(config.scans):
         visits.append(
             place.visit(index, visits[-1].arranged if visits else NOWHERE, last, frames[index], rng)
         )
         last |= visits[-1].poses
+        if index:
+            looked_at_next.append(place.looked_at_by(visits[-2], visits[-1].poses))
+            visits[-2] = replace(visits[-2], frames=())  # many images
     return RealScene(
         name=name,
         scans=tuple(v.scan for v in visits),
         objects=tuple(_object(n, furnished, visits) for n in furnished.vertices),
         shown=tuple(v.shown for v in visits),
         looked_at=tuple(v.looked_at for v in visits),
+        looked_at_next=(*looked_at_next, {}),
         T_room_camera=tuple(v.path for v in visits),
         frames=kind,
         room_m=room_m,
@@ -177,9 +186,15 @@ class Place:
             scan=scan,
             shown={names[k]: s for k, s in shown.items()},
             seen={n: seen_of(where[n], k, whole.owner, frames, sensor) for k, n in enumerate(names)},
-            looked_at={n: float(in_sight(p, frames, sensor).mean()) for n, p in expected.items()},
+            looked_at=_shares_in_sight(expected, frames, sensor),
             path=path,
+            frames=frames,
         )
+
+    def looked_at_by(self, visit: Visit, after: Mapping[str, Pose]) -> dict[str, float]:
+        """Of what is there after a visit and was not at it, the share of its place that was within sight."""
+        places = {n: _placed(self.room.samples[n], p) for n, p in after.items() if n not in visit.poses}
+        return _shares_in_sight(places, visit.frames, self.config.scanned.sensor)
 
     def _arranged(
         self,
@@ -225,6 +240,12 @@ class Place:
             taken.append((x, y, r + 0.1 if standing[n][:, 2].max() > TALL_M else 0.7 * r))
         path = walk(targets, taken, self.room_m, self.config.scanned.walk, blind, rng)
         return path if blind is None else turned_away(path, blind, self.config.scanned.sensor)
+
+
+def _shares_in_sight(
+    places: Mapping[str, np.ndarray], frames: Sequence[Frame], sensor: DepthSensor
+) -> dict[str, float]:
+    return {n: float(in_sight(p, frames, sensor).mean()) for n, p in places.items()}
 
 
 def _placed(points: np.ndarray, pose: Pose) -> np.ndarray:

@@ -93,9 +93,9 @@ class FlyingScene:
     name: str = "room"
     regime: str = "sparse"
     T_scan_room: tuple[Pose, ...] = ()
-    looked_at: tuple[
-        dict[str, float], ...
-    ] = ()  # regime `real`, a scan: how much of an object's last place it saw
+    # Regime `real`, a scan: how much of an object's last place it saw, and of the place of what came by the next scan.
+    looked_at: tuple[dict[str, float], ...] = ()
+    looked_at_next: tuple[dict[str, float], ...] = ()
 
 
 def flying_scene(
