@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from jaxtyping import Float
 
 from train.furniture.collections import SourceMesh
 from train.rooms.arrangement import Circle, arrange, circle
@@ -74,7 +75,8 @@ class Visit:
     seen: dict[str, np.ndarray]
     looked_at: dict[str, float]
     path: np.ndarray
-    frames: Sequence[Frame]
+    frames: Sequence[Frame] = ()  # while the next visit needs them: many images
+    looked_at_next: dict[str, float] = field(default_factory=dict)
 
     @property
     def poses(self) -> dict[str, Pose]:
@@ -102,24 +104,14 @@ def real_scene(
         colors=_colors(furnished, rng),
         config=config,
     )
-    visits: list[Visit] = []
-    looked_at_next: list[dict[str, float]] = []
-    last: dict[str, Pose] = {}  # where each object stood when it was there last
-    for index in range(config.scans):
-        visits.append(
-            place.visit(index, visits[-1].arranged if visits else NOWHERE, last, frames[index], rng)
-        )
-        last |= visits[-1].poses
-        if index:
-            looked_at_next.append(place.looked_at_by(visits[-2], visits[-1].poses))
-            visits[-2] = replace(visits[-2], frames=())  # many images
+    visits = place.visits(frames, rng)
     return RealScene(
         name=name,
         scans=tuple(v.scan for v in visits),
         objects=tuple(_object(n, furnished, visits) for n in furnished.vertices),
         shown=tuple(v.shown for v in visits),
         looked_at=tuple(v.looked_at for v in visits),
-        looked_at_next=(*looked_at_next, {}),
+        looked_at_next=tuple(v.looked_at_next for v in visits),
         T_room_camera=tuple(v.path for v in visits),
         frames=kind,
         room_m=room_m,
@@ -158,6 +150,19 @@ class Place:
     shell: list[Shape]
     colors: dict[str, np.ndarray]
     config: RealConfig
+
+    def visits(self, T_scan_room: Float[np.ndarray, "scans 4 4"], rng: np.random.Generator) -> list[Visit]:
+        """One visit a scan, each of the room as the one before left it."""
+        visits: list[Visit] = []
+        last: dict[str, Pose] = {}  # where each object stood when it was there last
+        for index, T in enumerate(T_scan_room):
+            visit = self.visit(index, visits[-1].arranged if visits else NOWHERE, last, T, rng)
+            if visits:
+                ahead = self.looked_at_by(visits[-1], visit.poses)
+                visits[-1] = replace(visits[-1], frames=(), looked_at_next=ahead)
+            visits.append(visit)
+            last |= visit.poses
+        return visits
 
     def visit(
         self,
