@@ -39,9 +39,10 @@ def not_looked_at(
 ) -> tuple[str, ...]:
     """Ids of those `missing` objects of which the scan, which lies in `frame`, cannot tell that they are gone.
 
-    It did not look at their last place, or still shows their surface there. A scan without background, or of unknown
-    frame, is taken to have looked everywhere.
+    It did not look at their last place, or still shows their surface there. A scan without background is taken to have
+    looked everywhere, and so is one that lies nobody knows how, or the place does.
     """
+    missing = [k for k in missing if not objects[k].observations[-1].frame.unknown]
     if len(scan.background) < LEAST_BACKGROUND or frame.unknown or not len(missing):
         return ()
 
@@ -61,6 +62,7 @@ def not_looked_at_before(
     `objects`: those known before. What is taken to have looked is as for `not_looked_at`.
     """
     unseen = dict[int, tuple[str, ...]]()
+    fresh = [o for o in fresh if not o.observations[-1].frame.unknown]
     for scan in reversed(scans):
         if not fresh or len(scan.background) < LEAST_BACKGROUND or scan.frame.unknown:
             break

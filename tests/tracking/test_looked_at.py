@@ -56,6 +56,14 @@ def missed(background, *clouds, T=None, upright=True, o=None):
 
 
 @pytest.mark.parametrize("upright", [True, False])
+def test_of_a_place_in_an_unknown_frame_no_scan_says_that_it_did_not_look(upright):
+    elsewhere = floor([-4, 0], [1.4, 3])
+    lost = new_object(0, 0, Instance(id=1, points=BOX), CODE, Frame(unknown=True))
+    assert missed(elsewhere, upright=upright) == ID
+    assert missed(elsewhere, upright=upright, o=lost) == ()
+
+
+@pytest.mark.parametrize("upright", [True, False])
 def test_bare_floor_where_it_stood_says_removed_and_none_says_not_seen(upright):
     assert missed(floor([0, 0], [4, 3]), upright=upright) == ()
     assert missed(floor([-4, 0], [1.4, 3]), upright=upright) == ID
@@ -144,10 +152,13 @@ def records(*backgrounds, frame=None):
     )
 
 
-def found_new(*backgrounds, upright=True, known=(), frame=None):
-    """What is said of a box that the last of several scans has alone, and of which earlier scans it is not seen."""
+def found_new(*backgrounds, upright=True, known=(), frame=None, own=None):
+    """What is said of a box that the last of several scans has alone, and of which earlier scans it is not seen.
+
+    `frame` is that of the earlier scans, `own` of the last.
+    """
     scans, last = records(*backgrounds, frame=frame), len(backgrounds)
-    new = new_object(1, last, Instance(id=1, points=BOX), CODE)
+    new = new_object(1, last, Instance(id=1, points=BOX), CODE, own or Frame())
     unseen = not_looked_at_before(known, [new], scans, upright)
     changes = changes_between(
         [new], last - 1, last, CONFIG, not_seen=not_seen_in(with_not_seen(scans, unseen))
@@ -178,6 +189,7 @@ def test_what_stood_there_before_was_looked_at():
 def test_a_scan_that_cannot_tell_is_taken_to_have_looked():
     assert found_new(np.zeros((0, 3))) == (["added"], [])
     assert found_new(ELSEWHERE, frame=Frame(unknown=True)) == (["added"], [])
+    assert found_new(ELSEWHERE, own=Frame(unknown=True)) == (["added"], [])  # where it stands nobody knows
     assert found_new(np.zeros((0, 3)), ELSEWHERE) == (["added"], [1])
 
 
