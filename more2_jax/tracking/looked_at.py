@@ -39,8 +39,8 @@ def not_looked_at(
 ) -> tuple[str, ...]:
     """Ids of those `missing` objects of which the scan, which lies in `frame`, cannot tell that they are gone.
 
-    It did not look at their last place, or still shows their surface there. A scan without background is taken to have
-    looked everywhere, and so is one that lies nobody knows how, or the place does.
+    It did not look at their last place, or still shows their surface there. Where that cannot be asked, it is taken to
+    have looked: without background, or where its frame or that of the last place is unknown.
     """
     missing = [k for k in missing if not objects[k].observations[-1].frame.unknown]
     if len(scan.background) < LEAST_BACKGROUND or frame.unknown or not len(missing):
