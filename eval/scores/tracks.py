@@ -16,7 +16,7 @@ from eval.scores.pose_scores import failed_pose, pose_scores
 from more2_jax.tracking.objects import accumulated_points, points_of
 from more2_jax.types import LivingScene, Mesh
 
-LOOKED_AT = 0.1  # share of a place within a scan's sight: of less, nobody can know what stands there
+LEAST_IN_SIGHT = 0.1  # share of a place: of less, nobody can know what stands there
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -141,8 +141,8 @@ def changes_f1(scene: KnownScene, tracks: Sequence[Track]) -> float:
     """F1 of added and removed between scans that follow each other: instances that begin or end a presence.
 
     An object that is there and not seen has not come or gone, and a method cannot know; nor can it where the other scan
-    did not look at the place (less than `LOOKED_AT` of it). What is said of either counts neither way. A method that
-    says it did not look for something does not say that it came or went.
+    did not look at the place (less than `LEAST_IN_SIGHT` of it). What is said of either counts neither way. A method
+    that says it did not look for something does not say that it came or went.
     """
     said, true, open_ = set[str](), set[str](), set[str]()
     for k in range(1, len(scene.scans)):
@@ -153,7 +153,7 @@ def changes_f1(scene: KnownScene, tracks: Sequence[Track]) -> float:
                 if here in t.instance and other not in t.instance and other not in t.not_seen
             }
             for o in (o for o in scene.objects if here in o.instance and other not in o.instance):
-                if other in o.T_scan_model or scene.in_sight(o, other, here) < LOOKED_AT:
+                if other in o.T_scan_model or scene.in_sight(o, other, here) < LEAST_IN_SIGHT:
                     open_ |= {f"{name} {k} {i}" for i in o.masks(here)}
                 else:
                     true.add(f"{name} {k} {o.instance[here]}")

@@ -30,10 +30,8 @@ OTHER_COLOR = -1.0  # log likelihood ratio: what has less is of another color
 FREE_SHARE = 0.25
 # Two things are not in one place. A sliver is unlike the whole, but lies on it where nothing moved
 # (docs/developing/notebook/perfect_masks.md).
-IN_PLACE_M, IN_PLACE_RADII = (
-    0.04,
-    0.1,
-)  # a point so near the other cloud lies on it; radii are the larger cloud's
+IN_PLACE_M = 0.04  # a point so near the other cloud lies on it,
+IN_PLACE_RADII = 0.1  # and within such a share of the larger cloud's radius
 IN_PLACE_SHARE = 0.9  # of one cloud: if so much lies on the other, both are in one place
 IN_PLACE = 3.0  # log odds of such a pair, beyond an even chance
 MOST_EMPTY = 2 / 3  # of a cloud, by the other scan: if more is empty, its mask holds something else, too
