@@ -126,7 +126,8 @@ def fit_from_any_yaw(a: RoomShape, b: RoomShape) -> RoomFit | None:
 
 def fits_from_any_yaw(a: RoomShape, b: RoomShape) -> list[RoomFit]:
     """All poses that fit and differ, the closest first. Scans as `fit_from_any_yaw` takes them."""
-    rough = [_fit(a, _fewer(b), T, REACHES_M[:2]) for T in _begun(a, b)]
+    few = _fewer(b)
+    rough = [_fit(a, few, T, REACHES_M[:2]) for T in _begun(a, b)]
     most = max((f.share for f in rough), default=0.0)
     fits = [_fit(a, b, f.T_a_b, REACHES_M[1:]) for f in rough if f.share >= max(FITS, most) / 2]
     fits = _different([f for f in fits if f.share >= FITS], b)
@@ -166,7 +167,9 @@ def _on_other(a: RoomShape, b: RoomShape, T_a_b: Pose) -> tuple[float, float]:
     by half a turn, where walls fit, and what stands before them does not.
     """
     normals = _turned(T_a_b, b.normals)
-    distance, near = map(np.asarray, a.tree.query(apply_pose(T_a_b, b.points)))
+    # Bounded: of a pose that does not fit most lies far off, where a search would be long.
+    distance, near = map(np.asarray, a.tree.query(apply_pose(T_a_b, b.points), distance_upper_bound=FITS_M))
+    near = np.minimum(near, len(a.points) - 1)
     parallel = np.abs(np.einsum("ni,ni->n", normals, a.normals[near])) > PARALLEL
     on = (distance < FITS_M) & parallel
     axis = np.abs(normals @ np.linalg.eigh(normals.T @ normals)[1]).argmax(axis=1)

@@ -116,7 +116,8 @@ def is_wide(points: Points) -> bool:
 
 def goes_on(plane: RoomPlane, tree: KDTree) -> bool:
     """Whether a plane goes on where the cloud ends; the rest of a tabletop that was cut off does not."""
-    return float((tree.query(plane.points)[0] > BEYOND_M).mean()) >= LEAST_BEYOND
+    near = np.isfinite(tree.query(plane.points, distance_upper_bound=BEYOND_M)[0])
+    return float((~near).mean()) >= LEAST_BEYOND
 
 
 def behind(plane: RoomPlane, room: Points) -> float:

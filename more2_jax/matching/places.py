@@ -37,6 +37,8 @@ IN_PLACE = 3.0  # log odds of such a pair, beyond an even chance
 MOST_EMPTY = 2 / 3  # of a cloud, by the other scan: if more is empty, its mask holds something else, too
 BY_PAIR = ("rows", "T_old_new", "top_gap_m", "off", "off_own")  # arrays of `AlignedPairs`
 BESIDE_M = 0.6  # centers of an object and of what a damaged mask shows of it, where it was
+LARGE_BESIDE = 0.5  # centers of large ones are farther apart: so much of one cloud lies on the other then
+FEW_POINTS = 200  # of a cloud, of which the share that lies on another one is told
 
 
 def motion_odds(
@@ -88,10 +90,13 @@ def shown_empty(seen: Seen | None, old: Points, new: Points, T_scene_scan: Pose)
 
 def lie_on(one: Points, other: Points) -> float:
     """Share of a cloud that lies on another one: of the one of which more does."""
-    radius = max(rms_radius(one), rms_radius(other))
-    near_m = min(IN_PLACE_M, IN_PLACE_RADII * radius)
-    ways = ((one, other), (other, one))
-    return max(float(np.isfinite(KDTree(b).query(a, distance_upper_bound=near_m)[0]).mean()) for a, b in ways)
+    near_m = min(IN_PLACE_M, IN_PLACE_RADII * max(rms_radius(one), rms_radius(other)))
+    return max(share_near(one, other, near_m), share_near(other, one, near_m))
+
+
+def share_near(cloud: Points, other: Points, near_m: float = IN_PLACE_M) -> float:
+    """Share of a cloud with a point of the other one so near."""
+    return float(np.isfinite(KDTree(other).query(cloud, distance_upper_bound=near_m)[0]).mean())
 
 
 def centers(aligned: AlignedPairs, T_scene_scan: Pose) -> tuple[Points, Points]:
@@ -103,14 +108,15 @@ def centers(aligned: AlignedPairs, T_scene_scan: Pose) -> tuple[Points, Points]:
 def with_neighbors(
     prior: Prior, aligned: AlignedPairs, matcher: EvidenceMatcher, motion: MotionModel, T_scene_scan: Pose
 ) -> AlignedPairs:
-    """The same with the pairs that lie beside each other, the scan lying at `T_scene_scan`.
+    """The same with the pairs that lie beside or on each other, the scan lying at `T_scene_scan`.
 
     Half of an object looks unlike the whole, so codes and sizes do not propose them where there is much else.
     """
     old, new = centers(aligned, T_scene_scan)
     beside = KDTree(old).sparse_distance_matrix(KDTree(new), BESIDE_M, output_type="coo_matrix")
+    near = {(int(k), int(i)) for k, i in zip(beside.row, beside.col, strict=True)}
     listed = set(map(tuple, aligned.rows.tolist()))
-    pairs = sorted({(int(k), int(i)) for k, i in zip(beside.row, beside.col, strict=True)} - listed)
+    pairs = sorted((near | on_each_other(aligned, T_scene_scan)) - listed)
     if not pairs:
         return aligned
     a, b = (signatures(side).inv for side in aligned.sides[::-1])
@@ -123,6 +129,26 @@ def with_neighbors(
     how = matcher.search, motion
     more = aligned_pairs(prior, aligned.ends, worth, how, T, aligned.seen)
     return together(aligned, more)
+
+
+def on_each_other(aligned: AlignedPairs, T_scene_scan: Pose) -> set[tuple[int, int]]:
+    """The pairs (object, instance) of which much of one lies on the other where nothing moved."""
+    new, old = aligned.sides
+    placed = (apply_pose(T_scene_scan, o.points) for o in new)
+    boxes = [np.array([(p.min(axis=0), p.max(axis=0)) for p in c]) for c in ((o.points for o in old), placed)]
+    (low, high), (first, last) = (np.moveaxis(b, 1, 0) for b in boxes)
+    meet = ((low[:, None] <= last) & (first <= high[:, None])).all(axis=-1)
+    found = set[tuple[int, int]]()
+    for k, i in np.argwhere(meet).tolist():
+        one, other = old[k].points, apply_pose(T_scene_scan, new[i].points)
+        if max(share_near(few(one), other), share_near(few(other), one)) >= LARGE_BESIDE:
+            found.add((k, i))
+    return found
+
+
+def few(points: Points) -> Points:
+    """`FEW_POINTS` of them or somewhat more, at even steps."""
+    return points[:: max(1, len(points) // FEW_POINTS)]
 
 
 def together(a: AlignedPairs, b: AlignedPairs) -> AlignedPairs:

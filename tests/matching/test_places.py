@@ -20,6 +20,7 @@ from more2_jax.matching.places import (
     in_place,
     lie_on,
     motion_odds,
+    on_each_other,
     stayed,
     with_neighbors,
 )
@@ -112,22 +113,7 @@ def test_neighbors_are_compared_as_if_they_had_been_proposed(tiny_prior, room):
     few = aligned_at(tiny_prior, half, second, matcher=dataclasses.replace(MATCHER, candidates=1))
     assert len(few.rows) < len(every.rows)
     kept = ~np.isin(few.rows @ [3, 1], [0])  # as if (0, 0) had not been proposed
-    fewer = dataclasses.replace(
-        few,
-        rows=few.rows[kept],
-        stayed=jax.tree.map(lambda x: x[kept], few.stayed),
-        found=jax.tree.map(lambda x: x[kept], few.found),
-        T_old_new=few.T_old_new[kept],
-        compared=Compared(
-            **{f.name: getattr(few.compared, f.name)[kept] for f in dataclasses.fields(Compared)}
-        ),
-        top_gap_m=few.top_gap_m[kept],
-        off=few.off[kept],
-        off_own=few.off_own[kept],
-        metric=dataclasses.replace(
-            few.metric, apart=few.metric.apart[kept], contradicted=few.metric.contradicted[kept]
-        ),
-    )
+    fewer = without(few, kept)
     found = with_neighbors(tiny_prior, fewer, MATCHER, "upright", np.eye(4))
     listed = [tuple(r) for r in found.rows.tolist()]
     assert listed == sorted(set(listed))
@@ -141,6 +127,50 @@ def test_neighbors_are_compared_as_if_they_had_been_proposed(tiny_prior, room):
     away = np.eye(4)
     away[1, 3] = 2 * BESIDE_M
     assert with_neighbors(tiny_prior, fewer, MATCHER, "upright", away) is fewer
+
+
+def test_an_end_of_what_is_long_is_compared_with_the_whole_though_their_centers_are_apart(tiny_prior):
+    rng = np.random.default_rng(3)
+    long = cloud(rng, np.array([3.0, 0.5, 0.6]), count=4000)
+    end = long[long[:, 0] < -0.9]
+    others = [cloud(rng, SIZES[1]) + [6.0, 2.0 * k, 0] for k in range(2)]
+    T = np.eye(4)
+    T[:2, :2] = [[0, -1], [1, 0]]
+    T[:3, 3] = [5.0, -2.0, 0.0]
+    seen = [apply_pose(np.linalg.inv(T), c) for c in (end, others[0])]
+    assert np.linalg.norm(long.mean(axis=0) - end.mean(axis=0)) > BESIDE_M
+    for old, new, found in (
+        ([long, *others], seen, {(0, 0), (1, 1)}),
+        (seen, [long, *others], {(0, 0), (1, 1)}),
+    ):
+        place = T if old is not seen else np.linalg.inv(T)
+        aligned = aligned_at(tiny_prior, old, new, place)
+        assert on_each_other(aligned, place) == found
+        assert on_each_other(aligned, np.eye(4)) == set()
+        kept = ~(aligned.rows == 0).all(axis=1)  # as if it had not been proposed
+        fewer = without(aligned, kept)
+        again = with_neighbors(tiny_prior, fewer, MATCHER, "upright", place)
+        assert {tuple(r) for r in again.rows.tolist()} == {tuple(r) for r in aligned.rows.tolist()}
+
+
+def without(aligned, kept):
+    """The pairs that are kept alone."""
+    return dataclasses.replace(
+        aligned,
+        rows=aligned.rows[kept],
+        stayed=jax.tree.map(lambda x: x[kept], aligned.stayed),
+        found=jax.tree.map(lambda x: x[kept], aligned.found),
+        T_old_new=aligned.T_old_new[kept],
+        compared=Compared(
+            **{f.name: getattr(aligned.compared, f.name)[kept] for f in dataclasses.fields(Compared)}
+        ),
+        top_gap_m=aligned.top_gap_m[kept],
+        off=aligned.off[kept],
+        off_own=aligned.off_own[kept],
+        metric=dataclasses.replace(
+            aligned.metric, apart=aligned.metric.apart[kept], contradicted=aligned.metric.contradicted[kept]
+        ),
+    )
 
 
 def test_heights_say_little_of_what_is_small():

@@ -14,7 +14,7 @@ import trimesh
 
 from more2_jax.scans.read_scan import read_scan
 from train import synthesize
-from train.furniture.closed_models import closed_model, make_cached, read_models
+from train.furniture.closed_models import cache_name, closed_model, make_cached, read_models
 from train.furniture.collections import SourceMesh, write_packed
 from train.rooms.cameras import SPARSE
 from train.rooms.regimes import FLYING, balanced, by_category, furniture, near_twin, scene_config
@@ -275,6 +275,14 @@ def test_models_that_cannot_be_used_are_told_with_the_reason(tmp_path):
     assert "flat" in (make_cached(flat, tmp_path) or "")
     assert "see --longest-m" in (make_cached(huge, tmp_path) or "")
     assert make_cached(huge, tmp_path) == make_cached(huge, tmp_path)
+
+
+def test_a_cache_does_not_give_one_source_what_was_made_of_another_that_differs_by_rounding():
+    first = MODELS[0]
+    other = dataclasses.replace(first, vertices=np.nextafter(first.vertices, np.inf))
+    assert other.content_hash == first.content_hash
+    assert cache_name(other) != cache_name(first)
+    assert cache_name(dataclasses.replace(first, name="another")) == cache_name(first)
 
 
 def test_units_axes_and_licenses_of_a_source(source):

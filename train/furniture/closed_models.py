@@ -81,8 +81,13 @@ def closed_model(mesh: SourceMesh) -> tuple[SourceMesh, int]:
 
 
 def cache_name(mesh: SourceMesh) -> str:
-    """Of the file that keeps a model: depends on its geometry and on how models are closed."""
-    return hashlib.sha1(f"{VERSION} {mesh.content_hash}".encode()).hexdigest() + ".npz"
+    """Of the file that keeps a model: depends on its geometry, to the bit, and on how models are closed.
+
+    Not on `content_hash`, which rounds: meshes equal to single precision can close to other vertices, and then
+    the model would depend on which of them came first.
+    """
+    geometry = mesh.vertices.astype("<f8").tobytes() + mesh.faces.astype("<i4").tobytes()
+    return hashlib.sha1(f"{VERSION} ".encode() + geometry).hexdigest() + ".npz"
 
 
 def make_cached(mesh: SourceMesh, cache: Path) -> str | None:
