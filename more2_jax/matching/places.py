@@ -32,7 +32,7 @@ FREE_SHARE = 0.25
 # (docs/developing/notebook/perfect_masks.md).
 IN_PLACE_M = 0.04  # a point so near the other cloud lies on it,
 IN_PLACE_RADII = 0.1  # and within such a share of the larger cloud's radius
-IN_PLACE_SHARE = 0.9  # of one cloud: if so much lies on the other, both are in one place
+IN_PLACE_SHARE = 0.7  # of one cloud: if so much lies on the other, both are in one place
 IN_PLACE = 3.0  # log odds of such a pair, beyond an even chance
 MOST_EMPTY = 2 / 3  # of a cloud, by the other scan: if more is empty, its mask holds something else, too
 BY_PAIR = ("rows", "T_old_new", "top_gap_m", "off", "off_own")  # arrays of `AlignedPairs`

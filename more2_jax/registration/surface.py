@@ -126,8 +126,11 @@ def refine_pair(
     poses, misfits, costs = jax.tree.map(lambda x: x[chosen], (poses, misfits, costs))
     doubt = prior_cost(prior, poses, costs, (source, target), settings)
     if settings.try_stayed:
-        costs += turned_in_place(poses, stayed, masked_mean(s.sampled.points, s.sampled.mask), costs)
+        moved = motion_since(stayed, poses, masked_mean(s.sampled.points, s.sampled.mask))
+        costs += turned_in_place(moved, costs)
     best = choose(costs, settings.try_stayed, doubt)
+    if settings.try_stayed:
+        best = simplest(best, costs, moved)
     T = polished(jax.tree.map(lambda x: x[best], poses), (source, target), misfits[best], settings, motion)
     if settings.try_stayed:  # what stayed is exactly where it was
         T = jax.tree.map(lambda x, y: jnp.where(best == len(misfits) - 1, y, x), T, stayed)
@@ -218,19 +221,44 @@ def asked_in_order(
 def choose(costs: Float[Array, " k"], stayed_is_last: bool, doubt: Float[Array, " k"] | float = 0.0) -> Array:
     """The pose that costs least; "it did not move" (the last) if it fits nearly as well: the simplest explanation."""
     if stayed_is_last:
-        costs = costs.at[-1].set((costs[-1] - STAYED_OFFSET) / STAYED_RATIO)
+        costs = costs.at[-1].set(simply(costs[-1]))
     return jnp.argmin(costs + doubt)
 
 
+def simplest(
+    best: Array, costs: Float[Array, " k"], moved: tuple[Float[Array, " k"], Float[Array, " k"]]
+) -> Array:
+    """The chosen pose, or "it did not move" (the last) if that hardly differs and fits nearly as well.
+
+    The prior has no say in that: a pose that was aligned lies on what it completes as it lies on what was seen; one
+    that was not is off both by what drift leaves, and the prior would have what stayed move by a little every time.
+    """
+    shift, turned = (x[best] for x in moved)
+    same = (shift < IN_PLACE) & (turned <= jnp.deg2rad(NOT_TURNED_DEG))
+    return jnp.where(same & (simply(costs[-1]) <= costs[best]), len(costs) - 1, best)
+
+
+def simply(cost: Float[Array, ""]) -> Float[Array, ""]:
+    """What "it did not move" costs, beside poses that are less simple."""
+    return (cost - STAYED_OFFSET) / STAYED_RATIO
+
+
+def motion_since(
+    stayed: jaxlie.SE3, poses: jaxlie.SE3, center: Float[Array, " 3"]
+) -> tuple[Float[Array, " k"], Float[Array, " k"]]:
+    """How far every pose puts a cloud's center from where it was, and by what angle it turns it, radians."""
+    shift = jnp.linalg.norm(jax.vmap(lambda T: T @ center)(poses) - stayed @ center, axis=-1)
+    return shift, jnp.linalg.norm((poses.rotation() @ stayed.rotation().inverse()).log(), axis=-1)
+
+
 def turned_in_place(
-    poses: jaxlie.SE3, stayed: jaxlie.SE3, center: Float[Array, " 3"], costs: Float[Array, " k"]
+    moved: tuple[Float[Array, " k"], Float[Array, " k"]], costs: Float[Array, " k"]
 ) -> Float[Array, " k"]:
     """What poses cost that leave a cloud's center where it was: things that are not moved are seldom turned.
 
-    What is round, or nearly the same turned around, would seem to turn at every scan.
+    What is round, or nearly the same turned around, would seem to turn at every scan. `moved`: of `motion_since`.
     """
-    shift = jnp.linalg.norm(jax.vmap(lambda T: T @ center)(poses) - stayed @ center, axis=-1)
-    turned = jnp.linalg.norm((poses.rotation() @ stayed.rotation().inverse()).log(), axis=-1)
+    shift, turned = moved
     in_place = (shift < IN_PLACE) & (turned > jnp.deg2rad(NOT_TURNED_DEG))
     return jnp.where(in_place, (TURNED_RATIO - 1) * costs + TURNED_OFFSET, 0.0)
 

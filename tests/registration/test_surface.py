@@ -14,7 +14,10 @@ from more2_jax.registration.surface import (
     as_good_as,
     asked_in_order,
     choose,
+    motion_since,
     nearly_as_good,
+    simplest,
+    simply,
     turned_in_place,
 )
 
@@ -63,10 +66,15 @@ def about_center(turn_deg, shift):
     return jaxlie.SE3.from_rotation_and_translation(R, t)
 
 
+@jax.jit
+def charged(poses, stayed, costs):
+    return turned_in_place(motion_since(stayed, poses, CENTER), costs)
+
+
 def cost_of(stayed, *motions):
     poses = [stayed @ m for m in motions]
     poses = jaxlie.SE3(jnp.stack([T.wxyz_xyz for T in poses]))
-    return jax.jit(turned_in_place)(poses, stayed, CENTER, COSTS[: len(motions)])
+    return charged(poses, stayed, COSTS[: len(motions)])
 
 
 def test_only_a_turn_where_a_thing_stood_has_to_fit_better_in_whatever_frame():
@@ -92,4 +100,23 @@ def test_what_looks_alike_turned_round_is_taken_to_stand_as_it_stood():
     for costs, best in (((0.10, 0.125), 1), ((0.10, 0.16), 0)):
         costs = jnp.asarray(costs)
         assert int(choose(costs, True)) == 0
-        assert int(choose(costs + turned_in_place(poses, stayed, CENTER, costs), True)) == best
+        assert int(choose(costs + charged(poses, stayed, costs), True)) == best
+
+
+def test_what_hardly_moved_stayed_if_that_fits_nearly_as_well_whatever_the_prior_says():
+    """An aligned pose and "it did not move"; the prior prefers the former, as it does what was aligned."""
+    stayed = about_center(20.0, 0.3)
+    small, turned, shifted = (
+        about_center(0.8 * NOT_TURNED_DEG, 0.5 * IN_PLACE),
+        about_center(1.2 * NOT_TURNED_DEG, 0.5 * IN_PLACE),
+        about_center(0.5 * NOT_TURNED_DEG, 1.5 * IN_PLACE),
+    )
+    near, far = jnp.asarray([0.3, 0.32]), jnp.asarray([0.3, 0.36])
+    assert simply(near[1]) < near[0] < simply(far[1])
+    for motion, costs, best in ((small, near, 1), (small, far, 0), (turned, near, 0), (shifted, near, 0)):
+        poses = jaxlie.SE3(jnp.stack([(stayed @ motion).wxyz_xyz, stayed.wxyz_xyz]))
+        moved = motion_since(stayed, poses, CENTER)
+        first = choose(costs, True, jnp.asarray([0.1, 0.3]))
+        assert int(first) == 0
+        assert int(simplest(first, costs, moved)) == best
+        assert int(simplest(jnp.asarray(1), costs, moved)) == 1
