@@ -131,13 +131,17 @@ def refine_pair(
     best = choose(costs, settings.try_stayed, doubt)
     if settings.try_stayed:
         best = simplest(best, costs, moved)
-    T = polished(jax.tree.map(lambda x: x[best], poses), (source, target), misfits[best], settings, motion)
+    aligned = polished(
+        jax.tree.map(lambda x: x[best], poses), (source, target), misfits[best], settings, motion
+    )
+    T = aligned
     if settings.try_stayed:  # what stayed is exactly where it was
         T = jax.tree.map(lambda x, y: jnp.where(best == len(misfits) - 1, y, x), T, stayed)
     found = dataclasses.replace(
         scored(T, s, t, settings, motion),
         loss=misfits[best],
         misfit=misfits[best],
+        aligned=aligned,
         competing=poses,
         competes=turned_apart(poses, best, TURNED_DEG) & nearly_as_good(costs + doubt, best),
     )

@@ -108,11 +108,11 @@ def relocalize(
     known = [o for o, _ in old]
     # Asked twice where the frame changes: what few pairs show is kept.
     sides = lru_cache(maxsize=1)(partial(with_views, known, new, config, views))
-    result, T_scene_scan = registered(prior, identified, sides, config, frame)
+    result, T_scene_scan, aligned = registered(prior, identified, sides, config, frame)
     if isinstance(config.matching, EvidenceMatcher):
-        frame = settled(views.objects, old, found, T_scene_scan, result, frame, new, config)
+        frame = settled(views.objects, old, found, aligned, result, frame, new, config)
         if not np.array_equal(frame.T_scene_scan, identified.frame.T_scene_scan):
-            result, T_scene_scan = registered(prior, identified, sides, config, frame)
+            result, T_scene_scan, _ = registered(prior, identified, sides, config, frame)
     return [
         observation(
             result,
@@ -134,13 +134,14 @@ def registered(
     sides: Callable[[tuple[Found, ...]], Sides],
     config: SceneConfig,
     frame: Frame,
-) -> tuple[Registration, Float[np.ndarray, "p 4 4"]]:
+) -> tuple[Registration, Float[np.ndarray, "p 4 4"], Float[np.ndarray, "p 4 4"]]:
     """All that was found registered, `frame` being the scan's; and the poses of instances in the scene's frame.
 
+    Last the same poses aligned, where "it did not move" was taken as it is: else each would only confirm the frame.
     In batches of as many pairs as `config.memory_mb` holds. `sides`: objects and instances, some with what sensors saw
     of them.
     """
-    found, parts = identified.found, list[tuple[Registration, np.ndarray]]()
+    found, parts = identified.found, list[tuple[Registration, np.ndarray, np.ndarray]]()
     at_once = min(PAIRS_AT_ONCE, max(1, config.memory_mb // PAIR_MB))
     for start in range(0, len(found), at_once):
         some = found[start : start + at_once]
@@ -148,7 +149,8 @@ def registered(
         if frame is not identified.frame:
             pairs = with_frame(pairs, frame.T_scene_scan)
         result = jax.device_get(register(prior, pairs, config.registration, config.motion))
-        parts.append((result, pairs.to_world(result.T_target_source)))
+        T, aligned = result.T_target_source, result.aligned
+        parts.append((result, pairs.to_world(T), pairs.to_world(T if aligned is None else aligned)))
     return parts[0] if len(parts) == 1 else jax.tree.map(lambda *x: np.concatenate(x), *parts)
 
 
