@@ -177,8 +177,7 @@ class Registration:
     misfit: Float[Array, "*batch"] | None = quantity("invariant", default=None)
     # Of (shift m, turn rad), about the target's local zero.
     covariance: Float[Array, "*batch 6 6"] | None = quantity("covariance", default=None)
-    # The same pose aligned, where "it did not move" was taken as it is: what tells how the scans lie.
-    aligned: jaxlie.SE3 | None = quantity("pose", default=None)
+    aligned: jaxlie.SE3 | None = quantity("pose", default=None)  # by the surfaces, also of what stayed
     competing: jaxlie.SE3 | None = quantity("pose", default=None)  # (*batch, k): other poses tried to the end
     # Which of them explain both clouds as well, turned otherwise.
     competes: Bool[Array, "*batch k"] | None = quantity("invariant", default=None)

@@ -125,16 +125,10 @@ def refine_pair(
     chosen = finalists(costs, poses, settings)
     poses, misfits, costs = jax.tree.map(lambda x: x[chosen], (poses, misfits, costs))
     doubt = prior_cost(prior, poses, costs, (source, target), settings)
-    if settings.try_stayed:
-        moved = motion_since(stayed, poses, masked_mean(s.sampled.points, s.sampled.mask))
-        costs += turned_in_place(moved, costs)
-    best = choose(costs, settings.try_stayed, doubt)
-    if settings.try_stayed:
-        best = simplest(best, costs, moved)
-    aligned = polished(
-        jax.tree.map(lambda x: x[best], poses), (source, target), misfits[best], settings, motion
-    )
-    T = aligned
+    moved = motion_since(stayed, poses, masked_mean(s.sampled.points, s.sampled.mask))
+    best, costs = decided(costs, doubt, moved, settings.try_stayed)
+    T = jax.tree.map(lambda x: x[best], poses)
+    T = aligned = polished(T, (source, target), misfits[best], settings, motion)
     if settings.try_stayed:  # what stayed is exactly where it was
         T = jax.tree.map(lambda x, y: jnp.where(best == len(misfits) - 1, y, x), T, stayed)
     found = dataclasses.replace(
@@ -220,6 +214,19 @@ def asked_in_order(
     order = jnp.argsort(costs)
     _, off = jax.lax.scan(ask, jnp.asarray(jnp.inf, costs.dtype), order)
     return field_cost(costs, jnp.zeros_like(costs).at[order].set(off), weight)
+
+
+def decided(
+    costs: Float[Array, " k"],
+    doubt: Float[Array, " k"],
+    moved: tuple[Float[Array, " k"], Float[Array, " k"]],
+    stayed_is_last: bool,
+) -> tuple[Array, Float[Array, " k"]]:
+    """The pose taken, and what all of them cost, turns in place included. `moved`: of `motion_since`."""
+    if not stayed_is_last:
+        return choose(costs, False, doubt), costs
+    costs += turned_in_place(moved, costs)
+    return simplest(choose(costs, True, doubt), costs, moved), costs
 
 
 def choose(costs: Float[Array, " k"], stayed_is_last: bool, doubt: Float[Array, " k"] | float = 0.0) -> Array:
