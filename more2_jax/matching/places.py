@@ -6,6 +6,7 @@ Beyond the paper (`EvidenceMatcher`).
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Set
 
 import jax
 import numpy as np
@@ -116,7 +117,7 @@ def with_neighbors(
     beside = KDTree(old).sparse_distance_matrix(KDTree(new), BESIDE_M, output_type="coo_matrix")
     near = {(int(k), int(i)) for k, i in zip(beside.row, beside.col, strict=True)}
     listed = set(map(tuple, aligned.rows.tolist()))
-    pairs = sorted((near | on_each_other(aligned, T_scene_scan)) - listed)
+    pairs = sorted((near - listed) | on_each_other(aligned, T_scene_scan, near | listed))
     if not pairs:
         return aligned
     a, b = (signatures(side).inv for side in aligned.sides[::-1])
@@ -131,15 +132,17 @@ def with_neighbors(
     return together(aligned, more)
 
 
-def on_each_other(aligned: AlignedPairs, T_scene_scan: Pose) -> set[tuple[int, int]]:
-    """The pairs (object, instance) of which much of one lies on the other where nothing moved."""
+def on_each_other(
+    aligned: AlignedPairs, T_scene_scan: Pose, known: Set[tuple[int, int]] = frozenset()
+) -> set[tuple[int, int]]:
+    """The pairs (object, instance), but those `known`, of which much of one lies on the other where nothing moved."""
     new, old = aligned.sides
     placed = (apply_pose(T_scene_scan, o.points) for o in new)
     boxes = [np.array([(p.min(axis=0), p.max(axis=0)) for p in c]) for c in ((o.points for o in old), placed)]
     (low, high), (first, last) = (np.moveaxis(b, 1, 0) for b in boxes)
     meet = ((low[:, None] <= last) & (first <= high[:, None])).all(axis=-1)
     found = set[tuple[int, int]]()
-    for k, i in np.argwhere(meet).tolist():
+    for k, i in set(map(tuple, np.argwhere(meet).tolist())) - known:
         one, other = old[k].points, apply_pose(T_scene_scan, new[i].points)
         if max(share_near(few(one), other), share_near(few(other), one)) >= LARGE_BESIDE:
             found.add((k, i))

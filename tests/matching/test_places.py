@@ -146,6 +146,7 @@ def test_an_end_of_what_is_long_is_compared_with_the_whole_though_their_centers_
         place = T if old is not seen else np.linalg.inv(T)
         aligned = aligned_at(tiny_prior, old, new, place)
         assert on_each_other(aligned, place) == found
+        assert on_each_other(aligned, place, {(0, 0), (2, 1)}) == {(1, 1)}
         assert on_each_other(aligned, np.eye(4)) == set()
         kept = ~(aligned.rows == 0).all(axis=1)  # as if it had not been proposed
         fewer = without(aligned, kept)
