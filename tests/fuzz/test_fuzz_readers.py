@@ -74,11 +74,8 @@ def test_what_counts_as_a_finding(monkeypatch, tmp_path, read, outcome):
     ("read", "limit_s", "outcome"),
     [
         ("while True: pass", 1.0, "no answer in 1 s"),
-        (
-            "import os; os.abort()",
-            60.0,
-            "the process died",
-        ),  # long: a busy machine may stand still for a second
+        # Long, as a busy machine may stand still for a second.
+        ("import os; os.abort()", 60.0, "the process died"),
         ("b = bytearray(200 << 20)", 60.0, "took"),
     ],
 )

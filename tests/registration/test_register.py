@@ -136,6 +136,19 @@ def test_a_symmetric_object_that_stayed_is_said_to_have_stayed(tiny_prior):
     np.testing.assert_allclose(found[0], np.eye(4), atol=1e-6)
 
 
+def test_what_drifted_a_little_is_held_where_it_was_and_aligned_beside(tiny_prior):
+    """Less than the noise of a point, so that both fit; more than that of all points together."""
+    clouds, rng = furniture()[:3], np.random.default_rng(0)
+    drift = [pieces.pose(Rotation.identity(), [0.005 * pieces.size(x), 0, 0]) for x in clouds]
+    noisy = [[x + rng.normal(0, 0.005 * pieces.size(x), x.shape) for x in clouds] for _ in range(2)]
+    pairs = pairs_of(tiny_prior, clouds_of(noisy[0]), clouds_of(moved(noisy[1], drift)))
+    record = register(tiny_prior, pairs, SURFACE, "free")
+    np.testing.assert_allclose(pairs.to_world(record.T_target_source), [np.eye(4)] * 3, atol=1e-6)
+    for T, true, cloud in zip(pairs.to_world(record.aligned), drift, clouds, strict=True):
+        off, held = (pieces.pose_error(x, true, cloud)[1] for x in (T, np.eye(4)))
+        assert off < 0.8 * held
+
+
 @pytest.mark.optimized  # a line turned round differs from itself by rounding
 def test_flat_straight_and_single_points_give_finite_poses(tiny_prior):
     cloud = furniture()[0]

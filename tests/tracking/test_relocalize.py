@@ -89,6 +89,31 @@ def test_a_scan_whose_frame_settles_elsewhere_is_refined_again_but_not_searched(
     assert refined == [(3, CONFIG.matching.search.keep)] * 2
 
 
+def test_a_frame_is_settled_by_aligned_poses_not_by_those_taken_to_have_stayed(
+    tiny_prior, first, monkeypatch
+):
+    original, settled, aligned_m = relocalize.register, [], 0.5
+
+    def register(*args):
+        result = original(*args)
+        lifted = result.aligned.wxyz_xyz + aligned_m * np.eye(7)[6]
+        return dataclasses.replace(result, aligned=type(result.aligned)(lifted))
+
+    def settled_frame(frame, places, *_):
+        settled.append(places)
+        return frame
+
+    monkeypatch.setattr(relocalize, "settled_frame", settled_frame)
+    heights = []
+    for how in (original, register):
+        monkeypatch.setattr(relocalize, "register", how)
+        made = add_scan(tiny_prior, first, scan("b", THEN), CONFIG)
+        heights.append([o.observations[-1].T_ref_scan[2, 3] for o in made.objects])
+    np.testing.assert_array_equal(*heights)
+    plain, lifted = (np.stack(places)[:, 2, 3] for places in settled)
+    np.testing.assert_allclose(lifted - plain, aligned_m, atol=1e-5)
+
+
 def test_pairs_registered_one_by_one_have_the_poses_they_have_together(tiny_prior, first, refined):
     second = scan("b", THEN)
     whole = add_scan(tiny_prior, first, second, CONFIG)
