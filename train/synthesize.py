@@ -72,6 +72,8 @@ class Settings:
     """Of regime real: perfect (as without), cut, dirty, split, merged, missed or mix."""
     lived_in: bool = False
     """Of regime real: 14 to 24 objects a room, sets that are alike, small things on furniture."""
+    reshaped: float = 0.0
+    """Of regime real: share of the objects that have another shape at every visit after the first."""
     room_m: tuple[float, float] | None = None
     """Floor, x by y; 7 by 6 without, in regime real as the furniture needs."""
     cache: Path | None = None
@@ -103,6 +105,7 @@ def main(settings: Annotated[Settings, tyro.conf.arg(name="")]) -> None:
         room_m=room_m,
         masks=masks,
         lived_in=crowded,
+        reshaped=s.reshaped,
     )
     claim(job)
     with processes(job, s.workers) as pool:
@@ -156,6 +159,7 @@ class Job:
     room_m: tuple[float, float] | None
     masks: Masks = "perfect"
     lived_in: bool = False
+    reshaped: float = 0.0
 
     @property
     def facts(self) -> dict[str, Any]:
@@ -171,6 +175,7 @@ class Job:
             "models": models.hexdigest(),
             **({"masks": self.masks} if self.regime == "real" else {}),
             **({"lived_in": True} if self.lived_in else {}),
+            **({"reshaped": self.reshaped} if self.reshaped else {}),
         }
 
 
@@ -262,6 +267,7 @@ def _furnished(
             free=job.free,
             room_m=job.room_m,
             things_on_furniture=job.lived_in,
+            reshaped=job.reshaped,
             scanned=ScanSettings(masks=job.masks),
         )
         return real_scene(chosen, config, rng, name)

@@ -111,6 +111,7 @@ def known(o: TrueObject, T_scan_room: Sequence[Pose] = ()) -> KnownObject:
         canonical=LONGEST / float(np.ptp(o.vertices, axis=0).max()),
         shared={k: o.instance[k] for k in o.merged},
         parts={k: ids for k, ids in o.parts.items() if k not in o.merged and ids},
+        reshaped=o.reshaped,
     )
 
 

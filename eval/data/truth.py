@@ -39,6 +39,8 @@ class KnownObject:
         default_factory=dict
     )  # where it has no mask of its own: another's that holds it
 
+    reshaped: frozenset[int] = frozenset()  # scans where its shape is not the one of `mesh`
+
     @property
     def first(self) -> int:
         """The scan in which it is seen first."""

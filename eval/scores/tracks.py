@@ -12,7 +12,7 @@ from eval.data.masks import LOST
 from eval.data.truth import KnownObject, KnownScene, Pose
 from eval.scores.figures import COLUMNS, Record
 from eval.scores.mesh_scores import RECONSTRUCTED, mesh_scores
-from eval.scores.pose_scores import failed_pose, pose_scores
+from eval.scores.pose_scores import Scores, failed_pose, pose_scores
 from more2_jax.tracking.objects import accumulated_points, points_of
 from more2_jax.types import LivingScene, Mesh
 
@@ -101,32 +101,41 @@ def pair_record(
 ) -> Record:
     """One true pair. `mr.*` and `mrr.*` are 1 or 0; the latter only where there is a true mesh.
 
+    Of what changed its shape between the two scans there is `m.*` alone: no pose is true of all of it.
     `says_motion`: the method says of what it found whether it moved: `told.strict` is then whether that is right, for
     scans that follow each other.
     """
     found = track.instance.get(k) if track else None
     other = scene.owner(k, found) if found is not None else None
-    scores = failed_pose()
-    if track is not None and other is not None and other.copies == o.copies and not lost:
-        T = np.linalg.inv(track.T_track_scan[o.first]) @ track.T_track_scan[k]
-        clouds = (
-            scene.instance(k, other.instance[k]).points,
-            scene.instance(o.first, o.instance[o.first]).points,
-        )
-        scores = pose_scores(T, o, other, k, o.first, *clouds)
-    record: Record = {"object": o.name, "category": o.category, "to_scan": k, **scores}
+    scores = found_pose(scene, o, other, k, track) if not lost else failed_pose()
+    rigid = not {k, o.first} & o.reshaped
+    record: Record = {"object": o.name, "category": o.category, "to_scan": k, **(scores if rigid else {})}
     for c in COLUMNS:
         if c == "published" and lost:
             continue
         same = other is o if c == "paper" else other is not None and other.copies == o.copies
         error = scores[f"re_deg.{c}"]
         record[f"m.{c}"] = float(same)
+        if not rigid:
+            continue
         if c == "strict" and says_motion and o.moved.get(k) is not None and k == o.first + 1:
             record["told.strict"] = float(same and track is not None and track.moved.get(k) == o.moved[k])
         record[f"mr.{c}"] = float(same and error is not None and error < right_deg)
         if recalled is not None:
             record[f"mrr.{c}"] = record[f"mr.{c}"] * float(recalled[c] > RECONSTRUCTED)
     return record
+
+
+def found_pose(
+    scene: KnownScene, o: KnownObject, other: KnownObject | None, k: int, track: Track | None
+) -> Scores:
+    """Scores of the pose of `other`, what a track takes for `o` in scan `k`; a failure unless they look alike."""
+    if track is None or other is None or other.copies != o.copies:
+        return failed_pose()
+    T = np.linalg.inv(track.T_track_scan[o.first]) @ track.T_track_scan[k]
+    source = scene.instance(k, other.instance[k]).points
+    target = scene.instance(o.first, o.instance[o.first]).points
+    return pose_scores(T, o, other, k, o.first, source, target)
 
 
 def object_recall(o: KnownObject, track: Track | None, samples: int) -> dict[str, float]:

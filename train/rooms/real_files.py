@@ -98,6 +98,8 @@ def _object(o: TrueObject, files: Mapping[str, str], shown: tuple[dict[str, Show
         r["instances"] = list(how.instances)
         if how.merged:
             r["merged"] = True
+        if r["scan"] in o.reshaped:
+            r["reshaped"] = True
     row["unseen"] = [
         {"scan": k, "T_scan_model": T.tolist(), "visible": round(o.visible(k), 4)}
         for k, T in sorted(o.T_scan_model.items())

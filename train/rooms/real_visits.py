@@ -13,6 +13,7 @@ from jaxtyping import Float
 
 from train.furniture.collections import SourceMesh
 from train.rooms.arrangement import Circle, arrange, circle
+from train.rooms.changed_shape import ShapeChange, shape_change
 from train.rooms.coloring import face_colors, model_colors, palette
 from train.rooms.depth_sensor import DepthSensor, Frame
 from train.rooms.frames import Frames, scan_frames
@@ -46,6 +47,7 @@ class RealConfig:
     free: bool = False  # any rest orientation instead of upright
     room_m: tuple[float, float] | None = None  # floor, x by y; None: as the furniture needs
     things_on_furniture: bool = False  # what is small stands on what is not
+    reshaped: float = 0.0  # share of the objects that have another shape at every visit after the first
     scanned: ScanSettings = field(default_factory=ScanSettings)
 
 
@@ -103,12 +105,13 @@ def real_scene(
         shell=shell(room_m, rng),
         colors=_colors(furnished, rng),
         config=config,
+        changes=_changes(furnished, config, rng),
     )
     visits = place.visits(frames, rng)
     return RealScene(
         name=name,
         scans=tuple(v.scan for v in visits),
-        objects=tuple(_object(n, furnished, visits) for n in furnished.vertices),
+        objects=tuple(_object(n, place, visits) for n in furnished.vertices),
         shown=tuple(v.shown for v in visits),
         looked_at=tuple(v.looked_at for v in visits),
         looked_at_next=tuple(v.looked_at_next for v in visits),
@@ -135,6 +138,17 @@ def _room_for(
     return round(max(least, area / y), 3), round(y, 3)
 
 
+def _changes(
+    room: Furnished, config: RealConfig, rng: np.random.Generator
+) -> tuple[dict[str, ShapeChange], ...]:
+    """A scan: how objects differ from their first shape."""
+    if not config.reshaped:
+        return ({},) * config.scans
+    some = [n for n in room.vertices if rng.random() < config.reshaped]
+    later = [{n: shape_change(room.vertices[n], rng) for n in some} for _ in range(config.scans - 1)]
+    return ({}, *later)
+
+
 def _colors(room: Furnished, rng: np.random.Generator) -> dict[str, np.ndarray]:
     """Colors of the faces of every object."""
     by_model = model_colors([m.name for m in room.models.values()], palette(rng), rng)
@@ -150,6 +164,7 @@ class Place:
     shell: list[Shape]
     colors: dict[str, np.ndarray]
     config: RealConfig
+    changes: tuple[dict[str, ShapeChange], ...]  # a scan: how objects differ from their first shape
 
     def visits(self, T_scan_room: Float[np.ndarray, "scans 4 4"], rng: np.random.Generator) -> list[Visit]:
         """One visit a scan, each of the room as the one before left it."""
@@ -173,7 +188,12 @@ class Place:
         rng: np.random.Generator,
     ) -> Visit:
         """Arranges the room and scans it."""
-        present = {n: v for n, v in self.room.vertices.items() if index in self.room.present[n]}
+        shape = self.changes[index]
+        present = {
+            n: shape[n](v) if n in shape else v
+            for n, v in self.room.vertices.items()
+            if index in self.room.present[n]
+        }
         static = [n for n in present if self.room.roles[n] == "static"]
         arranged = self._arranged(present, before, static, rng)
         poses = arranged.poses
@@ -184,8 +204,8 @@ class Place:
         names = list(present)
         scan = fused_scan(whole, frames, len(names), T_scan_room, self.config.scanned, rng)
         shown = shown_by(scan.instance, scan.owner, len(names), FEWEST)
-        where = {n: _placed(self.room.samples[n], p) for n, p in poses.items()}
-        expected = {n: _placed(self.room.samples[n], p) for n, p in {**poses, **last}.items()}
+        where = {n: self.samples_at(index, n, p) for n, p in poses.items()}
+        expected = {n: self.samples_at(index, n, p) for n, p in {**poses, **last}.items()}
         return Visit(
             arranged=arranged,
             scan=scan,
@@ -195,6 +215,11 @@ class Place:
             path=path,
             frames=frames,
         )
+
+    def samples_at(self, index: int, name: str, pose: Pose) -> np.ndarray:
+        """Samples of an object's surface at a visit, room's frame."""
+        samples, change = self.room.samples[name], self.changes[index].get(name)
+        return _placed(change(samples) if change else samples, pose)
 
     def looked_at_by(self, visit: Visit, after: Mapping[str, Pose]) -> dict[str, float]:
         """Of what is there after a visit and was not at it, the share of its place that was within sight."""
@@ -257,9 +282,9 @@ def _placed(points: np.ndarray, pose: Pose) -> np.ndarray:
     return points @ pose[:3, :3].T + pose[:3, 3]
 
 
-def _object(name: str, room: Furnished, visits: Sequence[Visit]) -> TrueObject:
+def _object(name: str, place: Place, visits: Sequence[Visit]) -> TrueObject:
     """The truth about one object; its poses are in the frames of the scans, also of those that do not show it."""
-    there = {k: v for k, v in enumerate(visits) if name in v.poses}
+    room, there = place.room, {k: v for k, v in enumerate(visits) if name in v.poses}
     model, role = room.models[name], room.roles[name]
     if role == "static" and any((v.poses[name] != visits[0].poses[name]).any() for v in there.values()):
         role = "moved"  # with what bears it
@@ -273,6 +298,7 @@ def _object(name: str, room: Furnished, visits: Sequence[Visit]) -> TrueObject:
         T_scan_model={k: np.round(v.scan.T_scan_room @ v.poses[name], 9) for k, v in there.items()},
         role=role,
         seen={k: v.seen[name] for k, v in there.items()},
+        reshaped=frozenset(k for k in there if name in place.changes[k]),
         license=model.license,
         source=model.source,
     )

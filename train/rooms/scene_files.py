@@ -216,6 +216,7 @@ def _object(folder: Path, row: Mapping[str, Any], seen: list[dict[str, np.ndarra
         seen={r["scan"]: seen[r["scan"]][row["id"]] for r in there},
         parts={r["scan"]: tuple(r["instances"]) for r in rows if "instances" in r},
         merged=frozenset(r["scan"] for r in rows if r.get("merged")),
+        reshaped=frozenset(r["scan"] for r in rows if r.get("reshaped")),
         symmetry_order=row["symmetry_order"],
         license=row.get("license", row.get("licence", "unknown")),
         source=row["source"],

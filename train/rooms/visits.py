@@ -70,6 +70,7 @@ class TrueObject:
         default_factory=dict
     )  # where masks are predicted: all that show it
     merged: frozenset[int] = frozenset()  # scans whose `instance` is mostly another object's
+    reshaped: frozenset[int] = frozenset()  # scans in which it has another shape than `vertices`
 
     def visible(self, scan: int) -> float:
         """Share of the surface that the scan sees."""
