@@ -63,6 +63,8 @@ class PriorConfig:
     eqv_gain: float = 1.0  # F_eqv is multiplied by this for the decoder.
     inv_gain: float = 1.0  # F_inv is multiplied by this for the decoder.
     bare_decoder: bool = False  # Whether a second decoder serves objects without normals.
+    # A code is the mean over so many draws of the cloud's points, other than in training.
+    draws: int = 1
 
 
 @dataclass(frozen=True)

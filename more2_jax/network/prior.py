@@ -22,6 +22,7 @@ from jaxtyping import Bool, Float
 from more2_jax.config import PriorConfig, from_dict
 from more2_jax.geometry.full_precision import full_precision
 from more2_jax.geometry.points import cleared, farthest_rows
+from more2_jax.network.code_draws import draws, mean_code
 from more2_jax.network.decoder import Decoder, ObjectField
 from more2_jax.network.encoder import Encoder, neighbor_counts
 from more2_jax.network.row_map import in_blocks
@@ -61,9 +62,11 @@ def init_prior(config: PriorConfig, key: Array, name: str = "random") -> Prior:
 def _shapes(config: PriorConfig) -> tuple[dict[str, Any], Embedding]:
     """Shapes and dtypes of all weights, and of the embedding of one cloud; computes nothing.
 
-    Raises ValueError if a block would choose from fewer points than `neighbors`.
+    Raises ValueError if a block would choose from fewer points than `neighbors`, or there is no draw.
     """
     e = config.encoder
+    if config.draws < 1:
+        raise ValueError(f"{config.draws} draws of a cloud; needed one or more")
     if (least := min(neighbor_counts(e, e.points))) < e.neighbors:
         raise ValueError(f"{e.points} points leave a block {least}; needed {e.neighbors} neighbors or more")
     key = jax.eval_shape(lambda: jax.random.key(0))
@@ -141,10 +144,19 @@ def encode_one(
     mask: Bool[Array, " n"],
     normals: Float[Array, "n 3"] | None = None,
 ) -> Embedding:
-    """Φ of one cloud: farthest-point sampling to the encoder's input size, then the network; differentiable."""
+    """Φ of one cloud: farthest-point sampling to the encoder's input size, then the network; differentiable.
+
+    With `draws` in the prior's settings, the mean over so many draws of the cloud.
+    """
     points = cleared(points, mask)
-    index, real = farthest_rows(points, mask, points_read(prior.config))
-    return encode_ordered(prior, points[index], real, None if normals is None else normals[index])
+
+    def code(some: Bool[Array, " n"]) -> Embedding:
+        index, real = farthest_rows(points, some, points_read(prior.config))
+        return encode_ordered(prior, points[index], real, None if normals is None else normals[index])
+
+    if prior.config.draws == 1:
+        return code(mask)
+    return mean_code(jax.vmap(code)(draws(points, mask, prior.config.draws, prior.config.encoder.points)))
 
 
 @jax.jit

@@ -21,10 +21,17 @@ POINTS, BATCH = 512, 8  # what clouds are padded to and how many there are, of c
 LEAVES = ("inv", "eqv", "scale", "center")
 
 
-@pytest.fixture(scope="module", params=["tiny", pytest.param("small", marks=pytest.mark.slow)])
+@pytest.fixture(
+    scope="module", params=[("tiny", 1), ("tiny", 3), pytest.param(("small", 1), marks=pytest.mark.slow)]
+)
 def prior(request):
-    config = load_config(CONFIGS / f"{request.param}.yaml", TrainingRun).model
-    return init_prior(config, jax.random.key(1), request.param)
+    name, draws = request.param
+    config = load_config(CONFIGS / f"{name}.yaml", TrainingRun).model
+    return init_prior(dataclasses.replace(config, draws=draws), jax.random.key(1), name)
+
+
+def with_draws(prior: Prior, draws: int) -> Prior:
+    return dataclasses.replace(prior, config=dataclasses.replace(prior.config, draws=draws))
 
 
 def furniture(seed: int, count: int = 300) -> np.ndarray:
@@ -80,8 +87,10 @@ def test_similarity_equivariance(prior):
     assert max(d.max() for d in deviations.values()) <= 1e-4, deviations
 
 
-def test_similarity_equivariance_in_float64(tiny_prior):
+@pytest.mark.parametrize("draws", [1, 4])
+def test_similarity_equivariance_in_float64(tiny_prior, draws):
     """The law itself, without float32's rounding: all of it to a billionth of the object's size."""
+    tiny_prior = with_draws(tiny_prior, draws)
     scale, shift = 100.0, np.array([600.0, -800.0, 3.0])
     turn = Rotation.random(random_state=1).as_matrix()
     cloud = furniture(5, count=128)
@@ -218,6 +227,11 @@ def test_init_refuses_an_input_too_small_for_its_neighbors():
     assert neighbor_counts(config.encoder, 512)[-1] == 16
     with pytest.raises(ValueError, match="needed 16 neighbors"):
         init_prior(config, jax.random.key(0))
+
+
+def test_init_refuses_codes_of_no_draw():
+    with pytest.raises(ValueError, match="0 draws of a cloud; needed one or more"):
+        init_prior(PriorConfig(draws=0), jax.random.key(0))
 
 
 @pytest.mark.parametrize("value", [1e-12, 0.3, 1.0, 7e5])
