@@ -63,8 +63,7 @@ class PriorConfig:
     eqv_gain: float = 1.0  # F_eqv is multiplied by this for the decoder.
     inv_gain: float = 1.0  # F_inv is multiplied by this for the decoder.
     bare_decoder: bool = False  # Whether a second decoder serves objects without normals.
-    # A code is the mean over so many draws of the cloud's points, other than in training.
-    draws: int = 1
+    draws: int = 1  # A code is the mean over so many draws of the cloud, other than in training.
 
 
 @dataclass(frozen=True)

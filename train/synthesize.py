@@ -105,7 +105,7 @@ def main(settings: Annotated[Settings, tyro.conf.arg(name="")]) -> None:
         room_m=room_m,
         masks=masks,
         lived_in=crowded,
-        reshaped=s.reshaped,
+        reshaped=_reshaped(s),
     )
     claim(job)
     with processes(job, s.workers) as pool:
@@ -143,6 +143,15 @@ def _lived_in(s: Settings) -> bool:
     if s.lived_in and (s.regime != "real" or s.free):
         raise ValueError(f"lived in, regime {s.regime}, free {s.free}; needed regime real, upright")
     return s.lived_in
+
+
+def _reshaped(s: Settings) -> float:
+    """Raises ValueError if that is no share, or the regime has no such objects."""
+    if not 0 <= s.reshaped <= 1 or (s.reshaped and s.regime != "real"):
+        raise ValueError(
+            f"reshaped {s.reshaped}, regime {s.regime}; needed a share from 0 to 1, in regime real"
+        )
+    return s.reshaped
 
 
 @dataclass(frozen=True, kw_only=True)

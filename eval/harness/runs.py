@@ -100,8 +100,8 @@ def open_run(program: str, o: Options, settings: dict[str, Any]) -> Run:
 
 
 def weights_digest(prior: Prior) -> str:
-    """Names weights by their values."""
-    content = hashlib.sha256()
+    """Names weights by their values and settings: other draws make other codes of the same weights."""
+    content = hashlib.sha256(json.dumps(dataclasses.asdict(prior.config)).encode())
     for leaf in jax.tree.leaves(prior.params):
         content.update(np.ascontiguousarray(leaf).tobytes())
     return content.hexdigest()[:12]

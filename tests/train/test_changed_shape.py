@@ -8,7 +8,8 @@ from eval.data.flyingshape import known, read_open
 from eval.data.truth import KnownScene
 from eval.scores.tracks import Track, score_tracks
 from more2_jax.geometry.poses import apply_pose
-from train.furniture.collections import standing
+from train import synthesize
+from train.furniture.collections import standing, write_packed
 from train.rooms.changed_shape import BEND_M, HIP, JOINT, TURN_DEG, Bend, Turn, shape_change
 from train.rooms.real_files import write_real_scene
 from train.rooms.scene_files import read_scene
@@ -95,6 +96,15 @@ def test_no_pose_is_asked_of_what_changed_its_shape(folder):
         assert record["m.strict"] == 1
         assert ("mr.strict" in record) == ("told.strict" in record) == (name not in changed)
         assert record.get("mr.strict", 1.0) == 1
+
+
+@pytest.mark.parametrize(("regime", "reshaped"), [("real", 1.5), ("real", -0.1), ("sparse", 0.4)])
+def test_other_shares_and_regimes_are_refused(tmp_path, regime, reshaped):
+    source = tmp_path / "models.npz"
+    write_packed(source, MODELS)
+    settings = synthesize.Settings(source=source, regime=regime, out=tmp_path / "out", reshaped=reshaped)
+    with pytest.raises(ValueError, match=f"reshaped {reshaped}, regime {regime}; needed a share from 0 to 1"):
+        synthesize.main(settings)
 
 
 def test_without_the_option_nothing_is_drawn():
