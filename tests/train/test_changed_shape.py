@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from test_real_rooms import MODELS, made
+from hand_held_rooms import MODELS, made
 
 from eval.data.flyingshape import known, read_open
 from eval.data.truth import KnownScene
