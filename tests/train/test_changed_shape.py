@@ -10,6 +10,7 @@ from eval.scores.tracks import Track, score_tracks
 from more2_jax.geometry.poses import apply_pose
 from train import synthesize
 from train.furniture.collections import standing, write_packed
+from train.rooms import real_visits
 from train.rooms.changed_shape import BEND_M, HIP, JOINT, TURN_DEG, Bend, Turn, shape_change
 from train.rooms.real_files import write_real_scene
 from train.rooms.scene_files import read_scene
@@ -107,8 +108,10 @@ def test_other_shares_and_regimes_are_refused(tmp_path, regime, reshaped):
         synthesize.main(settings)
 
 
-def test_without_the_option_nothing_is_drawn():
-    plain, same = made(), made(reshaped=0.0)
+def test_without_the_option_nothing_is_drawn(monkeypatch):
+    plain = made()
+    monkeypatch.setattr(real_visits, "_changes", lambda room, config, rng: ({},) * config.scans)
+    same = made()
     for a, b in zip(plain.scans, same.scans, strict=True):
         np.testing.assert_array_equal(a.mesh.vertices, b.mesh.vertices)
     assert all(not known(o).reshaped for o in plain.objects if o.instance)
