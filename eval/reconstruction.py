@@ -142,7 +142,7 @@ def seen_objects(scenes: Sequence[KnownScene], scans: int) -> list[Seen]:
 
 def accumulated(scene: KnownScene, o: KnownObject, scans: int) -> Seen:
     """What the first `scans` scans saw of an object."""
-    there = [k for k, i in o.instance.items() if k < scans and i != LOST]
+    there = [k for k, i in o.instance.items() if k < scans and i != LOST and o.same_shape(0, k)]
     poses = [o.true_pose(o, k, 0) for k in there]
     seen = [scene.instance(k, o.instance[k]) for k in there]
     clouds = [apply_pose(T, i.points) for i, T in zip(seen, poses, strict=True)]

@@ -186,7 +186,7 @@ def true_pairs(scene: KnownScene, which: str = "all") -> list[TruePair]:
         for k in range(1, last)
         for o in scene.objects
         if o.instance.get(0, LOST) != LOST and o.instance.get(k, LOST) != LOST
-        if which != "rigid" or o.rigid is None or k in o.rigid
+        if o.same_shape(0, k) and (which != "rigid" or o.rigid is None or k in o.rigid)
     ]
 
 

@@ -38,13 +38,16 @@ class KnownObject:
     shared: dict[int, int] = field(
         default_factory=dict
     )  # where it has no mask of its own: another's that holds it
-
     reshaped: frozenset[int] = frozenset()  # scans where its shape is not the one of `mesh`
 
     @property
     def first(self) -> int:
         """The scan in which it is seen first."""
         return min(self.instance)
+
+    def same_shape(self, a: int, b: int) -> bool:
+        """Whether it has one shape in two scans, so that some pose lays one onto the other."""
+        return not {a, b} & self.reshaped
 
     def masks(self, scan: int) -> tuple[int, ...]:
         """Every instance of a scan that shows it."""

@@ -108,7 +108,7 @@ def pair_record(
     found = track.instance.get(k) if track else None
     other = scene.owner(k, found) if found is not None else None
     scores = found_pose(scene, o, other, k, track) if not lost else failed_pose()
-    rigid = not {k, o.first} & o.reshaped
+    rigid = o.same_shape(o.first, k)
     record: Record = {"object": o.name, "category": o.category, "to_scan": k, **(scores if rigid else {})}
     for c in COLUMNS:
         if c == "published" and lost:

@@ -18,7 +18,7 @@ from eval.harness.batched import PairToRegister, embed_all, register_all
 from eval.harness.options import Options, OptionsBeside, less_told
 from eval.harness.plots import draw_ecdf, draw_over_scans
 from eval.harness.results import finish
-from eval.harness.runs import open_run, run_scenes, start_run
+from eval.harness.runs import open_run, run_scenes, start_run, weights_digest
 from eval.matching import match_own
 from eval.scores.figures import Figure
 from more2_jax.config import DescentRegistration, SceneConfig, preset
@@ -229,3 +229,10 @@ def test_presets_without_descent_are_those_that_descend_and_differ_in_its_steps_
         }
         restored = dataclasses.replace(starts.registration, **steps)
         assert dataclasses.replace(starts, registration=restored) == whole
+
+
+def test_records_of_other_draws_of_the_same_weights_are_not_taken_for_ones_own(tiny_prior):
+    config = dataclasses.replace(tiny_prior.config, draws=4)
+    other = dataclasses.replace(tiny_prior, config=config)
+    assert weights_digest(other) != weights_digest(tiny_prior)
+    assert weights_digest(dataclasses.replace(other, config=tiny_prior.config)) == weights_digest(tiny_prior)

@@ -110,3 +110,10 @@ def test_decoders_of_other_encoders_or_settings_are_not_joined(both):
     ):
         with pytest.raises(ValueError, match="other settings"):
             joined(*pair)
+
+
+def test_draws_are_no_part_of_the_weights_and_those_of_the_seeing_decoder_stay(both):
+    seeing, bare = (one_decoder(both, normals) for normals in (True, False))
+    seeing = dataclasses.replace(seeing, config=dataclasses.replace(seeing.config, draws=4))
+    assert bare.config.draws == 1
+    assert joined(bare, seeing).config.draws == 4

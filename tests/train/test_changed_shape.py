@@ -5,7 +5,7 @@ import pytest
 from hand_held_rooms import MODELS, made
 
 from eval.data.flyingshape import known, read_open
-from eval.data.truth import KnownScene
+from eval.registration import true_pairs
 from eval.scores.tracks import Track, score_tracks
 from more2_jax.geometry.poses import apply_pose
 from train import synthesize
@@ -89,9 +89,9 @@ def test_no_pose_is_asked_of_what_changed_its_shape(folder):
         )
         for o in scene.objects
     ]
-    assert isinstance(scene, KnownScene)
     records = {r["object"]: r for r in score_tracks(scene, tracks, 5.0, 100, says_motion=True)}
     changed = {o.name for o in scene.objects if o.reshaped} & set(records)
+    assert {p.object.name for p in true_pairs(scene)} == set(records) - changed
     assert changed and set(records) - changed
     for name, record in records.items():
         assert record["m.strict"] == 1

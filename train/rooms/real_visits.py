@@ -173,7 +173,7 @@ class Place:
         for index, T in enumerate(T_scan_room):
             visit = self.visit(index, visits[-1].arranged if visits else NOWHERE, last, T, rng)
             if visits:
-                ahead = self.looked_at_by(visits[-1], visit.poses)
+                ahead = self.looked_at_by(visits[-1], index, visit.poses)
                 visits[-1] = replace(visits[-1], frames=(), looked_at_next=ahead)
             visits.append(visit)
             last |= visit.poses
@@ -221,9 +221,9 @@ class Place:
         samples, change = self.room.samples[name], self.changes[index].get(name)
         return _placed(change(samples) if change else samples, pose)
 
-    def looked_at_by(self, visit: Visit, after: Mapping[str, Pose]) -> dict[str, float]:
-        """Of what is there after a visit and was not at it, the share of its place that was within sight."""
-        places = {n: _placed(self.room.samples[n], p) for n, p in after.items() if n not in visit.poses}
+    def looked_at_by(self, visit: Visit, index: int, after: Mapping[str, Pose]) -> dict[str, float]:
+        """Of what is there at visit `index`, after this one, and was not at it: the share of its place within sight."""
+        places = {n: self.samples_at(index, n, p) for n, p in after.items() if n not in visit.poses}
         return _shares_in_sight(places, visit.frames, self.config.scanned.sensor)
 
     def _arranged(

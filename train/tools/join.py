@@ -34,7 +34,8 @@ def main(bare: str, seeing: str, out: Path) -> None:
 def joined(bare: Prior, seeing: Prior) -> Prior:
     """A prior with both decoders. Raises ValueError unless they differ in nothing but the reading of normals."""
     bare, seeing = one_decoder(bare, normals=False), one_decoder(seeing, normals=True)
-    if not seeing.config.decoder.normals or bare.config != without_normals(seeing.config):
+    same = dataclasses.replace(bare.config, draws=seeing.config.draws)  # which no weights depend on
+    if not seeing.config.decoder.normals or same != without_normals(seeing.config):
         raise ValueError(
             f"{bare.name!r} and {seeing.name!r} are of other settings; needed ones that differ in decoder.normals alone"
         )
