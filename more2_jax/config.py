@@ -257,7 +257,7 @@ class SceneConfig:
     memory_mb: int = 1024
     # Join split masks, divide merged ones, leave out floor and neighbors, take in what was cut off.
     repair_masks: bool = False
-    accumulate_misfit: float = 1.0  # An observation with a higher misfit is left out of the shape.
+    accumulate_misfit: float = 1.0  # What fits worse is left out of the shape, unless it shows all known so far.
     matching: Matcher = field(default_factory=CodeMatcher)
     registration: RegistrationMethod = field(default_factory=DescentRegistration)
     pose_graph: PoseGraphConfig = field(default_factory=PoseGraphConfig)

@@ -101,11 +101,11 @@ class SeenBlock:
         """`SeenSpace.empty` of places in the block."""
         if self.tree is None:
             return np.zeros(len(places), bool)
-        nearest, _ = self.tree.query(places, distance_upper_bound=reach_m)
         number = numbered(column)
         at = np.minimum(np.searchsorted(self.column, number), len(self.column) - 1)
-        below = (self.column[at] == number) & (self.lowest[at] < places[:, 2] - BELOW_M)
-        return np.isinf(nearest) & below
+        empty = (self.column[at] == number) & (self.lowest[at] < places[:, 2] - BELOW_M)
+        empty[empty] = np.isinf(self.tree.query(places[empty], distance_upper_bound=reach_m)[0])
+        return empty
 
 
 def column_of(points: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, "n 2"]:

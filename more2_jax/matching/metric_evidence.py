@@ -72,10 +72,13 @@ def metric_evidence(
             tree = KDTree(all_around(sides[1 - way][int(others[rows[0]])]))
             for n in rows.tolist():
                 poses = T_old_new[n] if way == 0 else np.linalg.inv(T_old_new[n])
-                moved = [apply_pose(T, samples[way][pairs[n, way]]) for T in poses]
-                apart[n, :, way] = [mean_apart(tree, p) for p in moved]
+                moved = np.concatenate([apply_pose(T, samples[way][pairs[n, way]]) for T in poses])
+                off = shares_off(tree, moved)
+                apart[n, :, way] = off.reshape(len(poses), -1).mean(axis=1)
                 if seen is not None:
-                    lies_empty = seen[way].empty(np.concatenate(moved), APART_M)
+                    far = off == 1.0  # what lies near the other cloud lies near something that its scan saw
+                    lies_empty = np.zeros(len(moved), bool)
+                    lies_empty[far] = seen[way].empty(moved[far], APART_M)
                     empty[n, :, way] = lies_empty.reshape(len(poses), -1).mean(axis=1)
     return MetricEvidence(apart=apart, contradicted=empty.max(axis=-1))
 
@@ -91,7 +94,7 @@ def samples_of(ready: AlignableObject, origin: Float[np.ndarray, "b 3"]) -> Samp
     return [points[k][mask[k]] + origin[k] for k in range(len(points))]
 
 
-def mean_apart(tree: KDTree, points: Float[np.ndarray, "n 3"]) -> float:
-    """Mean distance of points from a cloud, truncated at `APART_M` and as a share of it."""
+def shares_off(tree: KDTree, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+    """Distances of points from a cloud, truncated at `APART_M` and as shares of it."""
     nearest, _ = tree.query(points, distance_upper_bound=APART_M)
-    return float(np.minimum(nearest / APART_M, 1.0).mean())
+    return np.minimum(nearest / APART_M, 1.0)

@@ -91,8 +91,13 @@ def shown_empty(seen: Seen | None, old: Points, new: Points, T_scene_scan: Pose)
 
 def lie_on(one: Points, other: Points) -> float:
     """Share of a cloud that lies on another one: of the one of which more does."""
-    near_m = min(IN_PLACE_M, IN_PLACE_RADII * max(rms_radius(one), rms_radius(other)))
-    return max(share_near(one, other, near_m), share_near(other, one, near_m))
+    return max(share_on(one, other), share_on(other, one))
+
+
+def share_on(cloud: Points, other: Points) -> float:
+    """Share of a cloud that lies on another one."""
+    near_m = min(IN_PLACE_M, IN_PLACE_RADII * max(rms_radius(cloud), rms_radius(other)))
+    return share_near(cloud, other, near_m)
 
 
 def share_near(cloud: Points, other: Points, near_m: float = IN_PLACE_M) -> float:

@@ -11,8 +11,9 @@ import numpy as np
 from jaxtyping import Float
 
 from more2_jax.config import EvidenceMatcher, SceneConfig, SurfaceRegistration
-from more2_jax.geometry.poses import Points, Pose, local_poses
+from more2_jax.geometry.poses import Points, Pose, apply_pose, local_poses
 from more2_jax.geometry.transform import transform
+from more2_jax.matching.places import share_on
 from more2_jax.network.prior import Prior
 from more2_jax.registration.pair_batch import PairBatch, local_batch, pair_up
 from more2_jax.registration.pose_costs import asks_sensors
@@ -33,6 +34,9 @@ Sides = tuple[list[ObservedObject], list[ObservedObject]]  # objects, and instan
 
 PAIR_MB = 2  # of a pair ready to be registered: both clouds, codes, and what sensors saw (1.2 MB)
 PAIRS_AT_ONCE = 32  # at most, whatever memory there is: more are not faster
+# Of all that is known of an object: if a scan shows so much again, what else it shows belongs to it, however badly a
+# sliver and the whole fit both ways (docs/developing/notebook/accumulation.md).
+SHOWN_AGAIN = 0.9
 
 
 def known_object(
@@ -122,6 +126,7 @@ def relocalize(
             scan,
             views.instances[f.instance].id,
             frame,
+            shows_again(known[f.object], new[f.instance], T_scene_scan[n]),
             config,
         )
         for n, f in enumerate(found)
@@ -201,6 +206,11 @@ def position_sigma(result: Registration, n: int) -> float:
     return float(np.sqrt(np.diagonal(np.asarray(result.covariance)[n])[:3].sum()))
 
 
+def shows_again(old: ObservedObject, new: ObservedObject, T_scene_scan: Pose) -> bool:
+    """Whether an instance shows nearly all that is known of an object, placed where that is."""
+    return share_on(old.points, apply_pose(T_scene_scan, new.points)) >= SHOWN_AGAIN
+
+
 def observation(
     result: Registration,
     n: int,
@@ -209,9 +219,13 @@ def observation(
     scan: int,
     instance: int,
     frame: Frame,
+    shown_again: bool,
     config: SceneConfig,
 ) -> Observation:
-    """Pair `n` of a registration as an observation of its object."""
+    """Pair `n` of a registration as an observation of its object.
+
+    One that fits badly is no part of the object's shape, unless all that is known is `shown_again`.
+    """
     turn_sigma = 0.0
     if result.covariance is not None:
         turn_sigma = float(np.sqrt(np.diagonal(np.asarray(result.covariance)[n])[3:].sum()))
@@ -228,7 +242,7 @@ def observation(
         sigma_deg=float(np.rad2deg(turn_sigma)),
         frame=frame,
         misfit=misfit,
-        accumulated=misfit <= config.accumulate_misfit,
+        accumulated=shown_again or misfit <= config.accumulate_misfit,
     )
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from factories import embedding, living_scene, turn_z
 from scipy.spatial.transform import Rotation
-from small_scenes import CONFIG, MARK, piece
+from small_scenes import CONFIG, MARK, piece, scan
 
 from more2_jax.geometry.observations import own_normals, own_points, with_poses
 from more2_jax.geometry.poses import apply_pose
@@ -25,8 +25,8 @@ from more2_jax.tracking.objects import (
     points_of,
     seen_again,
 )
-from more2_jax.tracking.relocalize import known_object
-from more2_jax.types import Instance, Observation, Scan, ScanRecord, SceneObject
+from more2_jax.tracking.relocalize import known_object, shows_again
+from more2_jax.types import Instance, Observation, ObservedObject, Scan, ScanRecord, SceneObject
 
 TURNED = turn_z(np.pi, np.zeros(3), np.array([2.0, 0.0, 0.0]))  # back to front, elsewhere
 
@@ -51,6 +51,39 @@ def test_doubted_points_are_kept_but_no_part_of_the_shape(tiny_prior):
     np.testing.assert_allclose(accumulated_points(o), np.tile(piece(0), (2, 1)), atol=1e-9)
     known, _ = known_object(o, None, CONFIG)
     np.testing.assert_allclose(known.points, np.tile(piece(0), (2, 1)) + [0, 1.0, 0], atol=1e-9)
+
+
+def shown(s: Scan, id_: int, keep) -> Scan:
+    """The scan with some points of one instance."""
+    less = (dataclasses.replace(i, points=i.points[keep(i.points)]) if i.id == id_ else i for i in s.instances)
+    return dataclasses.replace(s, instances=tuple(less))
+
+
+@pytest.mark.optimized
+@pytest.mark.parametrize("first_is_sliver", [True, False])
+def test_a_scan_that_shows_all_that_is_known_again_adds_to_the_shape(tiny_prior, first_is_sliver):
+    places = {0: (0.3, 3.0), 1: (0.0, 0.0), 2: (0.0, 6.0)}
+    scans = [shown(scan("a", places), 11, lambda p: p[:, 0] < -0.75), scan("b", places)]
+    first, then = scans if first_is_sliver else scans[::-1]
+    strict = dataclasses.replace(CONFIG, accumulate_misfit=0.3)  # without noise a sliver and the whole reach 0.43
+    o = add_scan(tiny_prior, start_scene(tiny_prior, first, strict), then, strict).objects[1]
+    assert len(o.observations) == 2 and o.observations[1].misfit > strict.accumulate_misfit
+    assert o.observations[1].accumulated is first_is_sliver
+    assert len(accumulated_points(o)) == (len(o.points) if first_is_sliver else len(piece(1)))
+
+
+def test_shown_again_is_what_lies_on_the_new_points_in_their_place():
+    whole, sliver = piece(0), piece(0)[:100]
+    known, new = (new_object_seen(p) for p in (sliver, whole))
+    apart = turn_z(0.0, np.zeros(3), np.array([0.2, 0.0, 0.0]))
+    assert shows_again(known, new, np.eye(4)) and not shows_again(new, known, np.eye(4))
+    assert not shows_again(known, new, apart)
+    assert shows_again(known, new_object_seen(apply_pose(np.linalg.inv(apart), whole)), apart)
+
+
+def new_object_seen(points: np.ndarray) -> ObservedObject:
+    """A cloud as stages take it."""
+    return ObservedObject(points=points, embedding=embedding(np.random.default_rng(0), points.mean(axis=0)))
 
 
 def test_a_doubted_observation_leaves_the_mesh_as_it_is(tiny_prior):
@@ -149,7 +182,8 @@ def test_what_moves_is_written_back_and_what_is_doubted_stays(tiny_prior):
 def test_what_fits_worse_than_the_limit_is_left_out(tiny_prior, limit, sure):
     config = dataclasses.replace(CONFIG, accumulate_misfit=limit)
     rng = np.random.default_rng(0)
-    noisy = apply_pose(TURNED, piece(0) + rng.normal(0, 0.005, piece(0).shape))
+    part = piece(0)[::2][piece(0)[::2, 2] > -0.2]  # all of it would be shown again
+    noisy = apply_pose(TURNED, part + rng.normal(0, 0.005, part.shape))
     scans = [
         Scan(name=n, source=n, instances=(Instance(id=1, points=p),))
         for n, p in (("a", piece(0)), ("b", noisy))
@@ -159,7 +193,7 @@ def test_what_fits_worse_than_the_limit_is_left_out(tiny_prior, limit, sure):
     seen = o.observations[1]
     assert 0 < seen.misfit < 0.5
     assert seen.accumulated is sure
-    assert len(accumulated_points(o)) == (2 if sure else 1) * len(piece(0))
+    assert len(accumulated_points(o)) == len(piece(0)) + (len(part) if sure else 0)
     (whole,) = reconstruct(tiny_prior, made, config).objects
     assert len(whole.observations) == 2
     assert made.changes[0].moved == (o.id,)
