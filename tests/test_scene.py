@@ -188,12 +188,14 @@ def test_several_scans_confirm_one_another_one_does_not(monkeypatch, tiny_prior,
         "extract_mesh",
         lambda prior, code, meshing, *_: asked.append(meshing.screening_length_multi_scan),
     )
+    farther = dataclasses.replace(ROBUST.meshing, screening_length_multi_scan=0.3)
+    config = dataclasses.replace(ROBUST, meshing=farther)
     often = scene.objects[0]
     doubted = tuple(
         dataclasses.replace(s, accumulated=s.scan == often.reference_scan) for s in often.observations
     )
     for o in (often, dataclasses.replace(often, observations=doubted)):
-        object_mesh.object_mesh(tiny_prior, accumulated_object(o, scene.scans), ROBUST)
+        object_mesh.object_mesh(tiny_prior, accumulated_object(o, scene.scans), config)
     assert len(often.observations) == 3
     assert asked == [ROBUST.meshing.outlier_factor_multi_scan, 0.3, ROBUST.meshing.outlier_factor, 0.0]
 
