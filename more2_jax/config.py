@@ -257,7 +257,7 @@ class SceneConfig:
     memory_mb: int = 1024
     # Join split masks, divide merged ones, leave out floor and neighbors, take in what was cut off.
     repair_masks: bool = False
-    accumulate_misfit: float = 1.0  # What fits worse is left out of the shape, unless it shows all known so far.
+    accumulate_misfit: float = 1.0  # What fits worse is no part of the shape, unless it shows all of it.
     matching: Matcher = field(default_factory=CodeMatcher)
     registration: RegistrationMethod = field(default_factory=DescentRegistration)
     pose_graph: PoseGraphConfig = field(default_factory=PoseGraphConfig)
@@ -276,7 +276,7 @@ ROBUST_MESHING = MeshingConfig(
     field_resolution=32,
     level="observed",
     mls_bandwidth=0.02,
-    screening_length=0.015,
+    screening_length=0.03,
     outlier_factor=1.5,
     outlier_factor_multi_scan=1.25,
     clip_to_floor=True,

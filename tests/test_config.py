@@ -188,7 +188,8 @@ def test_settings_written_before_they_were_renamed_still_read(tmp_path):
     path = tmp_path / "config.yaml"
     path.write_text(OLD_ROBUST)
     found, robust = load_config(path, SceneConfig), preset("robust")
-    assert found.meshing == robust.meshing and found.pose_graph == robust.pose_graph
+    then = dataclasses.replace(robust.meshing, screening_length=0.12, screening_length_multi_scan=0.3)
+    assert found.meshing == then and found.pose_graph == robust.pose_graph
 
 
 @pytest.mark.parametrize("values", [{"closing": {"most_turn_deg": 5.0}}, {"meshing": {"half_width": 0.7}}])

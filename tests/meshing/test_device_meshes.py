@@ -97,8 +97,11 @@ def assert_same(host, device, place, mean_cm, volume):
     a, b = solid(host, place), solid(device, place)
     assert b.is_watertight and b.is_winding_consistent
     assert max(apart_cm(a, b)[0], apart_cm(b, a)[0]) < mean_cm
-    assert b.volume == pytest.approx(a.volume, rel=volume)
+    assert abs(b.volume - a.volume) < max(volume * a.volume, SHEET_M * a.area)
 
+
+# Of sheets thinner than a cell a share of their volume says little: their surfaces may lie so far apart everywhere.
+SHEET_M = 2e-4
 
 # Twice the same places: of planes through three of them, which fits best is rounding.
 MEAN_CM = {"doubled": 0.3}

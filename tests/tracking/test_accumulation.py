@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from factories import embedding, living_scene, turn_z
 from scipy.spatial.transform import Rotation
-from small_scenes import CONFIG, MARK, piece, scan
+from small_scenes import CONFIG, MARK, piece
+from small_scenes import scan as pieces
 
 from more2_jax.geometry.observations import own_normals, own_points, with_poses
 from more2_jax.geometry.poses import apply_pose
@@ -55,7 +56,9 @@ def test_doubted_points_are_kept_but_no_part_of_the_shape(tiny_prior):
 
 def shown(s: Scan, id_: int, keep) -> Scan:
     """The scan with some points of one instance."""
-    less = (dataclasses.replace(i, points=i.points[keep(i.points)]) if i.id == id_ else i for i in s.instances)
+    less = (
+        dataclasses.replace(i, points=i.points[keep(i.points)]) if i.id == id_ else i for i in s.instances
+    )
     return dataclasses.replace(s, instances=tuple(less))
 
 
@@ -63,9 +66,11 @@ def shown(s: Scan, id_: int, keep) -> Scan:
 @pytest.mark.parametrize("first_is_sliver", [True, False])
 def test_a_scan_that_shows_all_that_is_known_again_adds_to_the_shape(tiny_prior, first_is_sliver):
     places = {0: (0.3, 3.0), 1: (0.0, 0.0), 2: (0.0, 6.0)}
-    scans = [shown(scan("a", places), 11, lambda p: p[:, 0] < -0.75), scan("b", places)]
+    scans = [shown(pieces("a", places), 11, lambda p: p[:, 0] < -0.75), pieces("b", places)]
     first, then = scans if first_is_sliver else scans[::-1]
-    strict = dataclasses.replace(CONFIG, accumulate_misfit=0.3)  # without noise a sliver and the whole reach 0.43
+    strict = dataclasses.replace(
+        CONFIG, accumulate_misfit=0.3
+    )  # without noise a sliver and the whole reach 0.43
     o = add_scan(tiny_prior, start_scene(tiny_prior, first, strict), then, strict).objects[1]
     assert len(o.observations) == 2 and o.observations[1].misfit > strict.accumulate_misfit
     assert o.observations[1].accumulated is first_is_sliver
