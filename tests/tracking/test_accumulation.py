@@ -68,9 +68,8 @@ def test_a_scan_that_shows_all_that_is_known_again_adds_to_the_shape(tiny_prior,
     places = {0: (0.3, 3.0), 1: (0.0, 0.0), 2: (0.0, 6.0)}
     scans = [shown(pieces("a", places), 11, lambda p: p[:, 0] < -0.75), pieces("b", places)]
     first, then = scans if first_is_sliver else scans[::-1]
-    strict = dataclasses.replace(
-        CONFIG, accumulate_misfit=0.3
-    )  # without noise a sliver and the whole reach 0.43
+    # Without noise a sliver and the whole reach a misfit of 0.43.
+    strict = dataclasses.replace(CONFIG, accumulate_misfit=0.3)
     o = add_scan(tiny_prior, start_scene(tiny_prior, first, strict), then, strict).objects[1]
     assert len(o.observations) == 2 and o.observations[1].misfit > strict.accumulate_misfit
     assert o.observations[1].accumulated is first_is_sliver
