@@ -28,6 +28,7 @@ from more2_jax.meshing.grid import (
 )
 from more2_jax.meshing.observed_surface import ObservedSurface, fit_observed_surface, uniform_subsample
 from more2_jax.meshing.screened_poisson import LEAST_MARGIN
+from more2_jax.meshing.unseen import raised
 from more2_jax.network.prior import Prior, sdf_one
 from more2_jax.types import Embedding, Mesh
 
@@ -74,7 +75,7 @@ def extract_mesh(
     check_resolutions(config)
     lowest = lowest_height(embedding, floor)
     surface = observed_surface(prior, embedding, seen, config, lowest, seen_from, normals)
-    field = partial(_field, prior, embedding, level)
+    field = partial(_raised, prior, embedding, level, surface, config.unseen_rise)
     values = partial(_corrected, surface, lowest)
     found = _sampled(field, values, cube(config.coarse_resolution, half_width))
     asked = config.field_resolution or config.resolution
@@ -142,6 +143,19 @@ def check_resolutions(config: MeshingConfig) -> None:
 def _field(prior: Prior, embedding: Embedding, level: float, queries: Points) -> Float[np.ndarray, " p"]:
     """The field at canonical offsets from the center, less `level`."""
     return _in_chunks(_field_values, prior, embedding, queries) - level
+
+
+def _raised(
+    prior: Prior,
+    embedding: Embedding,
+    level: float,
+    surface: ObservedSurface | None,
+    rise: float,
+    queries: Points,
+) -> Float[np.ndarray, " p"]:
+    """The field less `level`, raised where nothing was observed."""
+    field = _field(prior, embedding, level, queries)
+    return field if surface is None else raised(surface, queries, field, rise)
 
 
 def _in_chunks(
