@@ -27,7 +27,7 @@ from more2_jax.meshing.grid import (
     upsampled,
 )
 from more2_jax.meshing.observed_surface import ObservedSurface, fit_observed_surface, uniform_subsample
-from more2_jax.meshing.screened_poisson import LEAST_MARGIN
+from more2_jax.meshing.screened_poisson import empty_space
 from more2_jax.meshing.unseen import raised
 from more2_jax.network.prior import Prior, sdf_one
 from more2_jax.types import Embedding, Mesh
@@ -225,7 +225,7 @@ def _screened(
     held = coarse.lattice.corners_near(surface.points, 0.5 * coarse.lattice.step)
     length = (surface.noiseless and config.screening_length_multi_scan) or config.screening_length
     # The same space around it for either length: more costs time and, measured, changes nothing.
-    margin = max(config.screening_length, LEAST_MARGIN)
+    margin = empty_space(config.screening_length)
     box = coarse.around(held | (coarse.field < 0), margin)
     step = finest if surface.resolves(finest) else box.lattice.step / 2
     lattice, field = box.lattice, box.field

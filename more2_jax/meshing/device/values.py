@@ -31,7 +31,7 @@ from more2_jax.meshing.observed_surface import (
     PLANE_NEIGHBORS,
     RESOLVED_RESIDUAL,
 )
-from more2_jax.meshing.screened_poisson import LEAST_MARGIN
+from more2_jax.meshing.screened_poisson import empty_space
 from more2_jax.network.decoder import ObjectField
 from more2_jax.network.prior import Prior, field_sdf, object_field
 from more2_jax.types import AnyArray, Embedding, pytree, quantity
@@ -99,7 +99,7 @@ def drawn_to_points(
         return corrected(field, planes, cells, o.half_width, config.mls_bandwidth)
     field = screened(jnp.maximum(field, below), planes, o, config)
     drawn = corrected(field, planes, cells, o.half_width, config.mls_bandwidth)
-    box = in_box(coarse, o.points, o.mask, cells, o.half_width, max(config.screening_length, LEAST_MARGIN))
+    box = in_box(coarse, o.points, o.mask, cells, o.half_width, empty_space(config.screening_length))
     return jnp.where(box, drawn, jnp.maximum(drawn.max(), 2 * o.half_width / cells))
 
 
@@ -198,5 +198,5 @@ def screened(field: Grid, planes: OrientedPlanes, o: PaddedObject, config: Meshi
         o.half_width,
         step,
         length,
-        max(config.screening_length, LEAST_MARGIN),
+        empty_space(config.screening_length),
     )
