@@ -15,7 +15,9 @@ from jaxtyping import Float
 from more2_jax.geometry.poses import Points
 from more2_jax.meshing.observed_surface import ObservedSurface, uniform_subsample
 
-RISE_REACH = 0.05  # canonical units: farther than this from any point the field rises no more
+RISE_REACH = 0.05  # canonical units, over which the field rises
+# Spacings of the points: no place between them is farther from all, where they lie in squares.
+BETWEEN = np.sqrt(0.5)
 FULL_RISE = 0.5  # winding number up to which it rises fully; from there less and less, at 1 not at all
 WINDING_POINTS = 2048  # at most, that the winding number is asked of
 QUERIES_AT_ONCE = 512  # their distances from all points stay in the caches
@@ -24,14 +26,18 @@ QUERIES_AT_ONCE = 512  # their distances from all points stay in the caches
 def raised(
     surface: ObservedSurface, queries: Points, field: Float[np.ndarray, " q"], rise: float
 ) -> Float[np.ndarray, " q"]:
-    """Field values plus `rise` times the distance to the nearest observed point, `RISE_REACH` at most.
+    """Field values plus `rise` times the distance from what was observed, `RISE_REACH` at most; canonical units.
 
-    Canonical units. What is inside by the field rises the less, the more the observed faces surround it.
+    What lies between neighboring points was observed. What is inside by the field rises the less, the more the observed
+    faces surround it.
     """
     if not rise:
         return field
-    distance, _ = surface.tree.query(queries, distance_upper_bound=RISE_REACH)
-    risen = rise * np.minimum(distance, RISE_REACH)
+    between = BETWEEN * float(
+        np.sqrt(np.median(surface.areas))
+    )  # a point stands for the square of the spacing
+    distance, _ = surface.tree.query(queries, distance_upper_bound=between + RISE_REACH)
+    risen = rise * np.clip(distance - between, 0.0, RISE_REACH)
     inside = np.flatnonzero(field < 0)
     count = len(surface.points)
     # Of fewer points each stands for more.

@@ -16,7 +16,14 @@ from more2_jax.meshing.device.unseen import raised as raised_on_device
 from more2_jax.meshing.extract import extract_mesh
 from more2_jax.meshing.grid import cube
 from more2_jax.meshing.observed_surface import fit_observed_surface
-from more2_jax.meshing.unseen import RISE_REACH, WINDING_POINTS, raised, share_of_rise, winding_number
+from more2_jax.meshing.unseen import (
+    BETWEEN,
+    RISE_REACH,
+    WINDING_POINTS,
+    raised,
+    share_of_rise,
+    winding_number,
+)
 from more2_jax.types import Embedding
 
 REACH = 0.03
@@ -62,14 +69,28 @@ def test_winding_does_not_depend_on_frame_or_scale_and_is_bounded_at_a_point():
 
 
 def test_the_field_rises_with_the_distance_from_what_was_seen():
-    points = sphere(500)
+    points = sphere(2000)
     surface = fit_observed_surface(points, points, REACH)
-    steps = np.array([0.0, 0.02, RISE_REACH, 3 * RISE_REACH])
-    queries = points[0] * (1 + steps[:, None] / 0.36)
-    field = np.array([0.1, 0.2, 0.3, 0.4])
+    between = BETWEEN * np.sqrt(np.median(surface.areas))
+    beyond = np.array([-between, 0.0, 0.02, RISE_REACH, 3 * RISE_REACH])
+    queries = points[0] * (1 + (between + beyond[:, None]) / 0.36)
+    field = np.array([0.1, 0.2, 0.3, 0.4, 0.5])
     risen = raised(surface, queries, field, RISE) - field
-    np.testing.assert_allclose(risen, RISE * np.minimum(steps, RISE_REACH), atol=1e-12)
+    np.testing.assert_allclose(risen, RISE * np.clip(beyond, 0, RISE_REACH), atol=1e-12)
     np.testing.assert_array_equal(raised(surface, queries, field, 0.0), field)
+
+
+@pytest.mark.parametrize("count", [100, 400, 6000])
+def test_what_lies_between_points_was_seen_however_few_they_are(count):
+    """A sheet sampled at random: where the field rises at all, there is a hole."""
+    points, normals, _ = disc(count, 0.5)
+    surface = fit_observed_surface(points, normals, REACH)
+    spacing = 0.5 * np.sqrt(np.pi / count)
+    assert BETWEEN * np.sqrt(np.median(surface.areas)) == pytest.approx(BETWEEN * spacing, rel=0.35)
+    places = disc(2000, 0.45)[0][::-1]
+    risen = raised(surface, places, np.full(2000, 0.1), RISE) - 0.1
+    assert (risen > 1e-9).mean() < 0.3  # exp(-π/2) of a plane with points at random
+    assert risen.max() < 2 * RISE * spacing
 
 
 def test_what_is_surrounded_stays_inside_however_unsure_the_field_is():

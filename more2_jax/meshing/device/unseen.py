@@ -9,8 +9,8 @@ from jaxtyping import Float
 
 from more2_jax.meshing.device.correction import OrientedPlanes, areas
 from more2_jax.meshing.device.lattice import corners, nearest_on_lattice
-from more2_jax.meshing.device.rows import at_rows, evenly
-from more2_jax.meshing.unseen import FULL_RISE, RISE_REACH, WINDING_POINTS
+from more2_jax.meshing.device.rows import at_rows, evenly, masked_median
+from more2_jax.meshing.unseen import BETWEEN, FULL_RISE, RISE_REACH, WINDING_POINTS
 
 CORNERS_AT_ONCE = 1024  # their distances from all points are held at once
 TOUCHING = 1e-6  # canonical units: no distance is smaller, as the root's slope at 0 is infinite
@@ -19,12 +19,13 @@ Grid = Float[Array, "c c c"]
 
 
 def raised(planes: OrientedPlanes, field: Grid, half_width: Float[Array, ""], rise: float) -> Grid:
-    """The field at the corners of a cube plus `rise` times the distance to the nearest point, as far as it reaches."""
+    """The field at the corners of a cube, risen with the distance from what was observed."""
     cells = len(field) - 1
     place = corners(cells, half_width)
     nearest = nearest_on_lattice(planes.points, planes.mask, cells, half_width).ravel()
     squared = ((place - at_rows(planes.points, nearest)) ** 2).sum(axis=1)
-    distance = jnp.sqrt(jnp.clip(squared, TOUCHING**2, RISE_REACH**2))
+    between = BETWEEN * jnp.sqrt(masked_median(areas(planes), planes.mask))
+    distance = jnp.clip(jnp.sqrt(jnp.maximum(squared, TOUCHING**2)) - between, 0.0, RISE_REACH)
     share = jnp.clip((1.0 - winding_number(place, planes)) / (1.0 - FULL_RISE), 0.0, 1.0)
     share = jnp.where(field.ravel() < 0, share, 1.0)
     return field + (rise * distance * share).reshape(field.shape)
