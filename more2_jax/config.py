@@ -222,9 +222,9 @@ class MeshingConfig:
     screening_length: float = 0.0
     # The same for points without noise that several scans saw. 0: as for one scan.
     screening_length_multi_scan: float = 0.0
-    unseen_rise: float = 0.0  # The field rises by so much of the distance from observed points.
     outlier_factor: float = 0.0  # Points with a larger local outlier factor are left out. 0: all points stay.
-    outlier_factor_multi_scan: float = 0.0  # The same for an object that several scans saw.
+    # The same for an object that several scans saw.
+    outlier_factor_multi_scan: float = 0.0
     clip_to_floor: bool = False  # Whether meshes end at the floor, if scans are upright and show it.
     # Where meshes are made: one at a time on the host, or many at once on the device. "auto": on CPUs the host, which
     # is faster there; on accelerators the device, of which one demo has been timed there.
