@@ -222,9 +222,11 @@ class MeshingConfig:
     screening_length: float = 0.0
     # The same for points without noise that several scans saw. 0: as for one scan.
     screening_length_multi_scan: float = 0.0
+    unseen_rise: float = (
+        0.0  # The field rises by so much of the distance from what was seen: of things on legs.
+    )
     outlier_factor: float = 0.0  # Points with a larger local outlier factor are left out. 0: all points stay.
-    # The same for an object that several scans saw.
-    outlier_factor_multi_scan: float = 0.0
+    outlier_factor_multi_scan: float = 0.0  # The same for an object that several scans saw.
     clip_to_floor: bool = False  # Whether meshes end at the floor, if scans are upright and show it.
     # Where meshes are made: one at a time on the host, or many at once on the device. "auto": on CPUs the host, which
     # is faster there; on accelerators the device, of which one demo has been timed there.
@@ -277,6 +279,7 @@ ROBUST_MESHING = MeshingConfig(
     level="observed",
     mls_bandwidth=0.02,
     screening_length=0.03,
+    unseen_rise=0.5,
     outlier_factor=1.5,
     outlier_factor_multi_scan=1.25,
     clip_to_floor=True,

@@ -188,7 +188,9 @@ def test_settings_written_before_they_were_renamed_still_read(tmp_path):
     path = tmp_path / "config.yaml"
     path.write_text(OLD_ROBUST)
     found, robust = load_config(path, SceneConfig), preset("robust")
-    then = dataclasses.replace(robust.meshing, screening_length=0.12, screening_length_multi_scan=0.3)
+    then = dataclasses.replace(
+        robust.meshing, screening_length=0.12, screening_length_multi_scan=0.3, unseen_rise=0.0
+    )
     assert found.meshing == then and found.pose_graph == robust.pose_graph
 
 

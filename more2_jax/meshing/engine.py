@@ -18,6 +18,7 @@ from more2_jax.meshing.object_mesh import (
     object_floor,
     object_mesh,
     object_meshes,
+    unseen_rise,
 )
 from more2_jax.meshing.observed_surface import uniform_subsample
 from more2_jax.network.prior import Prior
@@ -75,6 +76,7 @@ def as_row(o: AccumulatedObject, config: SceneConfig) -> PaddedObject:
         box_half_width(o),
         object_floor(o, config),
         in_several_scans(o),
+        unseen_rise(o, config),
         None if sensors is None else uniform_subsample(sensors),
         None if normals is None else uniform_subsample(normals),
     )

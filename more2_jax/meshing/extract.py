@@ -27,7 +27,8 @@ from more2_jax.meshing.grid import (
     upsampled,
 )
 from more2_jax.meshing.observed_surface import ObservedSurface, fit_observed_surface, uniform_subsample
-from more2_jax.meshing.screened_poisson import LEAST_MARGIN
+from more2_jax.meshing.screened_poisson import empty_space
+from more2_jax.meshing.unseen import raised
 from more2_jax.network.prior import Prior, sdf_one
 from more2_jax.types import Embedding, Mesh
 
@@ -74,7 +75,7 @@ def extract_mesh(
     check_resolutions(config)
     lowest = lowest_height(embedding, floor)
     surface = observed_surface(prior, embedding, seen, config, lowest, seen_from, normals)
-    field = partial(_field, prior, embedding, level)
+    field = partial(_raised, prior, embedding, level, surface, config.unseen_rise)
     values = partial(_corrected, surface, lowest)
     found = _sampled(field, values, cube(config.coarse_resolution, half_width))
     asked = config.field_resolution or config.resolution
@@ -144,6 +145,19 @@ def _field(prior: Prior, embedding: Embedding, level: float, queries: Points) ->
     return _in_chunks(_field_values, prior, embedding, queries) - level
 
 
+def _raised(
+    prior: Prior,
+    embedding: Embedding,
+    level: float,
+    surface: ObservedSurface | None,
+    rise: float,
+    queries: Points,
+) -> Float[np.ndarray, " p"]:
+    """The field less `level`, raised where nothing was observed."""
+    field = _field(prior, embedding, level, queries)
+    return field if surface is None else raised(surface, queries, field, rise)
+
+
 def _in_chunks(
     program: Callable[[Prior, Embedding, np.ndarray], Array],
     prior: Prior,
@@ -211,7 +225,7 @@ def _screened(
     held = coarse.lattice.corners_near(surface.points, 0.5 * coarse.lattice.step)
     length = (surface.noiseless and config.screening_length_multi_scan) or config.screening_length
     # The same space around it for either length: more costs time and, measured, changes nothing.
-    margin = max(config.screening_length, LEAST_MARGIN)
+    margin = empty_space(config.screening_length)
     box = coarse.around(held | (coarse.field < 0), margin)
     step = finest if surface.resolves(finest) else box.lattice.step / 2
     lattice, field = box.lattice, box.field

@@ -17,6 +17,7 @@ from more2_jax.geometry.observations import seen_from
 from more2_jax.geometry.outliers import inliers
 from more2_jax.meshing.extract import HALF_WIDTH, extract_mesh, observed_level
 from more2_jax.meshing.observed_surface import uniform_subsample
+from more2_jax.meshing.open_below import openness
 from more2_jax.network.prior import Prior
 from more2_jax.types import AccumulatedObject, Mesh
 
@@ -60,6 +61,7 @@ def object_mesh(prior: Prior, o: AccumulatedObject, config: SceneConfig) -> Mesh
     level = observed_level(prior, o.embedding, points) if meshing.level == "observed" else 0.0
     if not in_several_scans(o):
         meshing = dataclasses.replace(meshing, screening_length_multi_scan=0.0)
+    meshing = dataclasses.replace(meshing, unseen_rise=unseen_rise(o, config))
     half_width, floor = box_half_width(o), object_floor(o, config)
     return extract_mesh(prior, o.embedding, meshing, half_width, level, points, floor, sensors, normals)
 
@@ -76,6 +78,12 @@ def object_floor(o: AccumulatedObject, config: SceneConfig) -> float | None:
         return None
     lowest = float(np.quantile(o.points[:, 2], BELOW_FLOOR_SHARE))
     return None if lowest < floor - BELOW_FLOOR_M else floor
+
+
+def unseen_rise(o: AccumulatedObject, config: SceneConfig) -> float:
+    """How much an object's field rises where nobody looked: what hides the floor beneath may be solid."""
+    asked = config.meshing.unseen_rise
+    return asked * openness(o.points, o.background) if asked and config.upright else 0.0
 
 
 def in_several_scans(o: AccumulatedObject) -> bool:

@@ -128,8 +128,12 @@ class ObservedSurface:
 
     def screened(self, field: Grid, lattice: Lattice, length: float, margin: float) -> Grid:
         """The field on a lattice, inside and outside corrected near the points; `length`: how far that reaches."""
-        area = surface_areas(self.points, self.normal, self.distance, self.neighbors)
-        return screened_poisson(field, lattice, self.points, self.normal, area, length, margin)
+        return screened_poisson(field, lattice, self.points, self.normal, self.areas, length, margin)
+
+    @cached_property
+    def areas(self) -> Float[np.ndarray, " n"]:
+        """The share of the surface each point stands for."""
+        return surface_areas(self.points, self.normal, self.distance, self.neighbors)
 
 
 def uniform_subsample(rows: Real[np.ndarray, "n *_"], most: int = MAX_POINTS) -> Real[np.ndarray, "m *_"]:

@@ -24,12 +24,17 @@ from more2_jax.meshing.grid import Grid, Lattice, Points
 TRANSITION_CELLS = (
     1.5  # on either side of the surface, in which the indicator goes from 1 to 0: the grid's sharpest
 )
-LEAST_MARGIN = 0.12  # canonical units of empty space around what the periodic box holds
+LEAST_MARGIN = 0.12
 # A neighbor lies on the same face if its normal is within 60° and at most this share of its squared distance is off the
 # face: the other face of a thin board does not halve the area.
 SAME_FACE_COSINE = 0.5
 SAME_FACE_FLATNESS = 0.1
 CELL_CORNERS = np.array(list(itertools.product((0, 1), repeat=3)))
+
+
+def empty_space(length: float) -> float:
+    """Canonical units of empty space around what the periodic box holds, for an equation that reaches `length`."""
+    return max(length, LEAST_MARGIN)
 
 
 def screened_poisson(

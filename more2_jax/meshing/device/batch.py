@@ -30,6 +30,7 @@ def padded_object(
     half_width: float,
     floor: float | None,
     several: bool,
+    rise: float = 0.0,
     sensors: Float[np.ndarray, "n s 3"] | None = None,
     normals: Float[np.ndarray, "n 3"] | None = None,
 ) -> PaddedObject:
@@ -50,6 +51,7 @@ def padded_object(
         "half_width": np.array(half_width, np.float32),
         "lowest": np.array(lowest_height(embedding, floor), np.float32),
         "several": np.array(several),
+        "rise": np.array(rise, np.float32),
     }
     return PaddedObject(embedding=dataclasses.replace(embedding, origin=None), **arrays)
 

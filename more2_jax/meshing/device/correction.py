@@ -8,6 +8,7 @@ from jax import Array
 from jaxtyping import Bool, Float, Int
 
 from more2_jax.meshing.device.lattice import axis_places, nearest_on_lattice
+from more2_jax.meshing.device.planes import surface_areas
 from more2_jax.meshing.device.rows import at_rows
 from more2_jax.meshing.observed_surface import (
     CUTOFF,
@@ -35,6 +36,11 @@ class OrientedPlanes:
     gap: Float[Array, ""] = quantity("length")
     residual: Float[Array, ""] = quantity("length")
     noiseless: Bool[Array, ""] = quantity("invariant")
+
+
+def areas(planes: OrientedPlanes) -> Float[Array, " n"]:
+    """The share of the surface each point stands for."""
+    return surface_areas(planes.points, planes.normal, planes.distance, planes.neighbors)
 
 
 def query_planes(planes: OrientedPlanes) -> Float[Array, "k n 8"]:

@@ -15,13 +15,14 @@ from more2_jax.config import MeshingConfig
 from more2_jax.geometry.full_precision import full_precision
 from more2_jax.geometry.points import nearest_index
 from more2_jax.meshing.device.box import in_box
-from more2_jax.meshing.device.correction import OrientedPlanes, corrected
+from more2_jax.meshing.device.correction import OrientedPlanes, areas, corrected
 from more2_jax.meshing.device.lattice import axis_places, corners, upsampled
 from more2_jax.meshing.device.neighbors import inliers, nearest_neighbors
-from more2_jax.meshing.device.planes import fit_planes, surface_areas
+from more2_jax.meshing.device.planes import fit_planes
 from more2_jax.meshing.device.rows import at_rows, evenly, masked_median, real_first
 from more2_jax.meshing.device.screened import screened_poisson
 from more2_jax.meshing.device.sides import Cloud, Views, outward_signs
+from more2_jax.meshing.device.unseen import raised
 from more2_jax.meshing.extract import ACCELERATOR_CHUNK, CHUNK, MAX_LEVEL, SAMPLES
 from more2_jax.meshing.observed_surface import (
     GAP_SPACINGS,
@@ -30,7 +31,7 @@ from more2_jax.meshing.observed_surface import (
     PLANE_NEIGHBORS,
     RESOLVED_RESIDUAL,
 )
-from more2_jax.meshing.screened_poisson import LEAST_MARGIN
+from more2_jax.meshing.screened_poisson import empty_space
 from more2_jax.network.decoder import ObjectField
 from more2_jax.network.prior import Prior, field_sdf, object_field
 from more2_jax.types import AnyArray, Embedding, pytree, quantity
@@ -51,6 +52,9 @@ class PaddedObject:
     half_width: Float[AnyArray, "*b"] = quantity("length")  # of the query box
     lowest: Float[AnyArray, "*b"] = quantity("length")  # nothing lies below; −∞ where there is no floor
     several: Bool[AnyArray, "*b"] = quantity("invariant")  # whether several scans saw it
+    rise: Float[AnyArray, "*b"] = quantity(
+        "invariant"
+    )  # of the field where nobody looked, a share of the distance
 
 
 @full_precision
@@ -67,31 +71,38 @@ def surface_values(prior: Prior, o: PaddedObject, config: MeshingConfig) -> Floa
     asked = asked_cells(config)
     level = observed_level(ask, o) if config.level == "observed" else 0.0
     coarse = ask(corners(asked, o.half_width)).reshape((asked + 1,) * 3) - level
-    values = coarse
-    while len(values) - 1 < cells:
-        values = upsampled(values)
     below = o.lowest - axis_places(cells, o.half_width)
+    values = at_resolution(coarse, cells)
     if config.mls_bandwidth:
-        drawn = drawn_to_points(ask, o, coarse, values, below, config)
+        drawn = drawn_to_points(ask, o, coarse, below, config)
         values = jnp.where(o.mask.sum() >= MIN_POINTS, drawn, values)
     return jnp.maximum(values, below)
+
+
+def at_resolution(coarse: Float[Array, "c c c"], cells: int) -> Float[Array, "r r r"]:
+    """A field interpolated to so many cells a side."""
+    while len(coarse) - 1 < cells:
+        coarse = upsampled(coarse)
+    return coarse
 
 
 def drawn_to_points(
     ask: Ask,
     o: PaddedObject,
     coarse: Float[Array, "c c c"],
-    field: Float[Array, "r r r"],
     below: Float[Array, " r"],
     config: MeshingConfig,
 ) -> Grid:
     """The field where there are points enough: inside and outside by these, near them their planes."""
     planes, cells = oriented_planes(ask, o), config.resolution
+    if config.unseen_rise:
+        coarse = raised(planes, coarse, o.half_width, o.rise)
+    field = at_resolution(coarse, cells)
     if not (config.screening_length and len(coarse) < len(field)):
         return corrected(field, planes, cells, o.half_width, config.mls_bandwidth)
     field = screened(jnp.maximum(field, below), planes, o, config)
     drawn = corrected(field, planes, cells, o.half_width, config.mls_bandwidth)
-    box = in_box(coarse, o.points, o.mask, cells, o.half_width, max(config.screening_length, LEAST_MARGIN))
+    box = in_box(coarse, o.points, o.mask, cells, o.half_width, empty_space(config.screening_length))
     return jnp.where(box, drawn, jnp.maximum(drawn.max(), 2 * o.half_width / cells))
 
 
@@ -180,16 +191,15 @@ def screened(field: Grid, planes: OrientedPlanes, o: PaddedObject, config: Meshi
     resolved = planes.residual < RESOLVED_RESIDUAL * finest
     several = planes.noiseless & o.several & (config.screening_length_multi_scan > 0)
     length = jnp.where(several, config.screening_length_multi_scan or 1.0, config.screening_length)
-    area = surface_areas(planes.points, planes.normal, planes.distance, planes.neighbors)
     step = jnp.where(resolved, finest, o.half_width / asked_cells(config))
     return screened_poisson(
         field,
         planes.points,
         planes.mask,
         planes.normal,
-        area,
+        areas(planes),
         o.half_width,
         step,
         length,
-        max(config.screening_length, LEAST_MARGIN),
+        empty_space(config.screening_length),
     )

@@ -1,0 +1,63 @@
+"""How much a scan shows beneath an object: what stands on legs hides little of the floor, what is solid hides it."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial import ConvexHull, KDTree, QhullError
+
+from more2_jax.geometry.poses import Points
+
+# Chosen on rooms of validation furniture, docs/developing/notebook/unseen_rise.md.
+CELL_M = (
+    0.05  # a side of the columns that the footprint is divided into: scans hold a point every few centimeters
+)
+BESIDE_M = 0.035  # so near a column's middle something was seen beneath,
+BESIDE_SPACINGS, MOST_BESIDE_M = (
+    2.0,
+    0.08,
+)  # or so many distances between neighbors, of a background that was thinned
+AROUND_M = 0.3  # of the footprint: how far apart the background's points lie
+LOWEST_SHARE = 0.005  # of the points lie lower than where the object begins: strays
+UNDER_M = (-0.15, 0.1)  # from there: the floor that it stands on, not one far below what hangs on a wall
+SOLID, OPEN = 0.5, 0.9  # shares of the footprint: up to the first it may be solid, from the second it is not
+
+
+def openness(points: Points, background: Points) -> float:
+    """0 for what may be solid, 1 for what stands on legs or on a thin foot; of an object and its room, meters, z up.
+
+    By how much of its footprint has something of the background beneath. 0 where the scan shows nothing.
+    """
+    return float(np.clip((share_seen_beneath(points, background) - SOLID) / (OPEN - SOLID), 0.0, 1.0))
+
+
+def share_seen_beneath(points: Points, background: Points) -> float:
+    """Share of the columns in an object's footprint (the convex hull, seen from above) with a background point beneath.
+
+    0 for points that lie on a line, seen from above.
+    """
+    columns = footprint(points[:, :2])
+    if not len(columns):
+        return 0.0
+    bottom = np.quantile(points[:, 2], LOWEST_SHARE)
+    low = [*(columns.min(axis=0) - AROUND_M), bottom + UNDER_M[0]]
+    high = [*(columns.max(axis=0) + AROUND_M), bottom + UNDER_M[1]]
+    beneath = background[((background > low) & (background < high)).all(axis=1), :2]
+    if len(beneath) < 2:
+        return 0.0
+    tree = KDTree(beneath)
+    apart = np.median(tree.query(beneath, k=2)[0][:, 1])
+    beside = np.clip(BESIDE_SPACINGS * apart, BESIDE_M, MOST_BESIDE_M)
+    return float(np.isfinite(tree.query(columns, distance_upper_bound=beside)[0]).mean())
+
+
+def footprint(points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "c 2"]:
+    """Middles of the columns inside the convex hull; none if the points lie on a line."""
+    try:
+        hull = ConvexHull(points)
+    except (QhullError, ValueError):  # on a line, or fewer than three
+        return np.zeros((0, 2))
+    low, high = points.min(axis=0), points.max(axis=0)
+    x, y = (np.arange(a + CELL_M / 2, b, CELL_M) for a, b in zip(low, high, strict=True))
+    middles = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
+    return middles[(middles @ hull.equations[:, :2].T + hull.equations[:, 2] <= 0).all(axis=1)]
