@@ -222,9 +222,7 @@ class MeshingConfig:
     screening_length: float = 0.0
     # The same for points without noise that several scans saw. 0: as for one scan.
     screening_length_multi_scan: float = 0.0
-    unseen_rise: float = (
-        0.0  # The field rises by so much of the distance from what was seen: of things on legs.
-    )
+    unseen_rise: float = 0.0  # Of things on legs: by what share of the distance to seen points a field rises.
     outlier_factor: float = 0.0  # Points with a larger local outlier factor are left out. 0: all points stay.
     outlier_factor_multi_scan: float = 0.0  # The same for an object that several scans saw.
     clip_to_floor: bool = False  # Whether meshes end at the floor, if scans are upright and show it.
