@@ -141,7 +141,7 @@ def test_nothing_lies_below_the_floor(hard, made):
 
 @pytest.mark.slow
 def test_objects_of_the_demo_have_the_hosts_meshes(prior):
-    """One scan's clouds as they are; and the same three times, as of several scans."""
+    """One scan's clouds as they are; and the same three times, as of several scans; in the cells of `robust`."""
     scan = read_scan(demo_scan_paths()[0])
     for n, instance in enumerate(scan.instances[:3]):
         scans = 3 if n % 2 else 1
@@ -149,8 +149,8 @@ def test_objects_of_the_demo_have_the_hosts_meshes(prior):
         clouds = instance.points + 0.001 * np.random.default_rng(n).normal(size=shape)
         points = np.concatenate(clouds)[:: scans + 4]
         o = dataclasses.replace(accumulated(prior, points - WORLD_M, scans), background=scan.background)
-        (found,) = device_meshes(prior, [o], CONFIG)
-        expected = object_mesh(prior, o, CONFIG)
+        (found,) = device_meshes(prior, [o], ROBUST)
+        expected = object_mesh(prior, o, ROBUST)
         assert expected is not None and found is not None
         assert_same(expected, found, points.mean(axis=0), 0.15, 0.03)
 
