@@ -30,6 +30,7 @@ from eval.peers.reconstruction import SURFACERS, Surfacer
 from eval.scores.figures import Column, Figure, Record
 from eval.scores.mesh_scores import RECONSTRUCTED, mesh_scores
 from more2_jax.config import SceneConfig, preset
+from more2_jax.geometry.open_below import most_seen_beneath
 from more2_jax.geometry.poses import apply_pose, turned
 from more2_jax.meshing.engine import meshes_of_objects
 from more2_jax.network.prior import Prior
@@ -223,9 +224,16 @@ def embedded(prior: Prior, seen: Sequence[Seen], batch: int) -> list[Accumulated
             normals=s.normals,
             sensors=tuple(few_sensors(s.scene.scans[seen.scan]) for seen in s.observations),
             background=remembered(s.scene.scans[0].background),
+            seen_beneath=seen_beneath(s),
         )
         for s, code in zip(seen, codes, strict=True)
     ]
+
+
+def seen_beneath(seen: Seen) -> float:
+    """The share of an object's footprint beneath which one of its scans shows background."""
+    backgrounds = [remembered(seen.scene.scans[o.scan].background) for o in seen.observations]
+    return most_seen_beneath(seen.points, [o.T_ref_scan for o in seen.observations], backgrounds)
 
 
 def fitted_in_batches(

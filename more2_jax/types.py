@@ -252,8 +252,8 @@ class AccumulatedObject:
     normals: Float[np.ndarray, "n 3"] | None = None  # unit, outward; zeros where not known. None: nowhere
     # Of each observation, where its scan's sensors stood, in that scan's frame; (0, 3) where not known.
     sensors: tuple[Float[np.ndarray, "_ 3"], ...]
-    # What was no object in the scan that saw it first, in the object's frame: its floor is that of this room.
-    background: Float[np.ndarray, "b 3"] = field(default_factory=NO_POINTS)
+    background: Float[np.ndarray, "b 3"] = field(default_factory=NO_POINTS)  # of its first scan, its frame
+    seen_beneath: float = 0.0  # share of its footprint beneath which a scan shows background (`open_below`)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -12,6 +12,7 @@ from factories import scene_object, turn_z
 from small_scenes import CONFIG, MARK, ROBUST, piece, scan
 
 from more2_jax.config import JointConfig, MeshingConfig, preset
+from more2_jax.geometry.poses import apply_pose
 from more2_jax.matching.calibration import alone_probability
 from more2_jax.meshing import engine, object_mesh
 from more2_jax.meshing.object_mesh import object_floor
@@ -291,6 +292,21 @@ def test_the_floor_under_an_object_is_that_of_its_room(scene, lowest, settings, 
     found = object_floor(accumulated_object(o, scans[:1]), config)
     assert found == (None if floor is None else pytest.approx(floor, abs=2e-3))
     assert object_floor(accumulated_object(o, scans[1:]), config) is None
+
+
+def test_what_any_scan_shows_beneath_an_object_counts(scene):
+    rng = np.random.default_rng(0)
+    room = np.column_stack([rng.uniform(-1, 1, (4000, 2)), np.zeros(4000)])
+    points = rng.uniform([-0.3, -0.3, 0.0], [0.3, 0.3, 0.7], (500, 3))
+    first = dataclasses.replace(scene.objects[0].observations[0], accumulated=True)
+    moved = dataclasses.replace(first, scan=1, T_ref_scan=turn_z(0.7, np.zeros(3), np.array([2.0, 0.0, 0.0])))
+    o = dataclasses.replace(
+        scene.objects[0], observations=(first, moved), points=points, point_scan=np.arange(500) % 2
+    )
+    there = apply_pose(np.linalg.inv(moved.T_ref_scan), room)  # in the second scan's frame
+    for backgrounds, share in (((room[:0], there), 1.0), ((room[:0], room), 0.0), ((room, room), 1.0)):
+        scans = [dataclasses.replace(s, background=b) for s, b in zip(scene.scans, backgrounds, strict=False)]
+        assert accumulated_object(o, scans).seen_beneath == share
 
 
 def test_every_new_mesh_is_kept_as_it_is_told_and_no_other(monkeypatch, tiny_prior, scene):

@@ -14,10 +14,10 @@ from jaxtyping import Float
 from more2_jax.config import SceneConfig
 from more2_jax.geometry.floor import floor_height
 from more2_jax.geometry.observations import seen_from
+from more2_jax.geometry.open_below import openness
 from more2_jax.geometry.outliers import inliers
 from more2_jax.meshing.extract import HALF_WIDTH, extract_mesh, observed_level
 from more2_jax.meshing.observed_surface import uniform_subsample
-from more2_jax.meshing.open_below import openness
 from more2_jax.network.prior import Prior
 from more2_jax.types import AccumulatedObject, Mesh
 
@@ -83,7 +83,7 @@ def object_floor(o: AccumulatedObject, config: SceneConfig) -> float | None:
 def unseen_rise(o: AccumulatedObject, config: SceneConfig) -> float:
     """How much an object's field rises where nobody looked: what hides the floor beneath may be solid."""
     asked = config.meshing.unseen_rise
-    return asked * openness(o.points, o.background) if asked and config.upright else 0.0
+    return asked * openness(o.seen_beneath) if config.upright else 0.0
 
 
 def in_several_scans(o: AccumulatedObject) -> bool:

@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
+from more2_jax.geometry.open_below import most_seen_beneath
 from more2_jax.geometry.poses import apply_pose
 from more2_jax.network.embedding_batch import embed
 from more2_jax.network.prior import Prior, anchor_levels
@@ -20,14 +21,16 @@ def accumulated_object(o: SceneObject, scans: Sequence[ScanRecord]) -> Accumulat
     row = np.zeros(1 + max(s.scan for s in seen), int)
     row[[s.scan for s in seen]] = np.arange(len(seen))
     kept = np.isin(o.point_scan, [s.scan for s in seen])
+    points, poses = accumulated_points(o), np.stack([s.T_ref_scan for s in seen])
     return AccumulatedObject(
-        points=accumulated_points(o),
+        points=points,
         observation=row[o.point_scan[kept]],
-        poses=np.stack([s.T_ref_scan for s in seen]),
+        poses=poses,
         embedding=o.embedding,
         normals=accumulated_normals(o),
         sensors=tuple(scans[s.scan].sensors for s in seen),
         background=apply_pose(reference_pose(o), scans[o.reference_scan].background),
+        seen_beneath=most_seen_beneath(points, list(poses), [scans[s.scan].background for s in seen]),
     )
 
 

@@ -77,6 +77,7 @@ def hard(prior):
         "one place": make(np.zeros((40, 3)) + [0.1, 0.0, 0.0]),
         "floor": make(box_points(700, 5), background=floor),
         "large": make(box_points(2000, 6, 0.01), 2),
+        "on legs": make(box_points(900, 7)[:600], 2, seen_beneath=0.8),
     }
 
 
@@ -113,7 +114,7 @@ NAMES = [
     "doubled",
     "one place",
 ]
-NAMES += ["floor", "large"]
+NAMES += ["floor", "large", "on legs"]
 
 
 @pytest.fixture(scope="module")
@@ -148,7 +149,7 @@ def test_objects_of_the_demo_have_the_hosts_meshes(prior):
         shape = (scans, *instance.points.shape)
         clouds = instance.points + 0.001 * np.random.default_rng(n).normal(size=shape)
         points = np.concatenate(clouds)[:: scans + 4]
-        o = dataclasses.replace(accumulated(prior, points - WORLD_M, scans), background=scan.background)
+        o = accumulated(prior, points - WORLD_M, scans, background=scan.background, seen_beneath=float(n < 2))
         (found,) = device_meshes(prior, [o], ROBUST)
         expected = object_mesh(prior, o, ROBUST)
         assert expected is not None and found is not None

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from jaxtyping import Float
 from scipy.spatial import ConvexHull, KDTree, QhullError
 
-from more2_jax.geometry.poses import Points
+from more2_jax.geometry.poses import Points, Pose, apply_pose
 
 # Chosen on rooms of validation furniture, docs/developing/notebook/unseen_rise.md.
 CELL_M = (
@@ -23,18 +25,24 @@ UNDER_M = (-0.15, 0.1)  # from there: the floor that it stands on, not one far b
 SOLID, OPEN = 0.5, 0.9  # shares of the footprint: up to the first it may be solid, from the second it is not
 
 
-def openness(points: Points, background: Points) -> float:
-    """0 for what may be solid, 1 for what stands on legs or on a thin foot; of an object and its room, meters, z up.
+def openness(seen_beneath: float) -> float:
+    """0 for what may be solid, 1 for what stands on legs or a thin foot, by the share of its footprint seen beneath."""
+    return float(np.clip((seen_beneath - SOLID) / (OPEN - SOLID), 0.0, 1.0))
 
-    By how much of its footprint has something of the background beneath. 0 where the scan shows nothing.
+
+def most_seen_beneath(points: Points, poses: Sequence[Pose], backgrounds: Sequence[Points]) -> float:
+    """`share_seen_beneath` an object by that scan which shows most; 0 without scans.
+
+    `poses` map the scans' frames, of `backgrounds`, onto the object's, in which z is up.
     """
-    return float(np.clip((share_seen_beneath(points, background) - SOLID) / (OPEN - SOLID), 0.0, 1.0))
+    shares = (share_seen_beneath(points, apply_pose(T, b)) for T, b in zip(poses, backgrounds, strict=True))
+    return max(shares, default=0.0)
 
 
 def share_seen_beneath(points: Points, background: Points) -> float:
     """Share of the columns in an object's footprint (the convex hull, seen from above) with a background point beneath.
 
-    0 for points that lie on a line, seen from above.
+    Meters, one frame, z up. 0 where the scan shows nothing, and for points that lie on a line, seen from above.
     """
     columns = footprint(points[:, :2])
     if not len(columns):
