@@ -296,7 +296,8 @@ def test_the_floor_under_an_object_is_that_of_its_room(scene, lowest, settings, 
 
 def test_what_any_scan_shows_beneath_an_object_counts(scene):
     rng = np.random.default_rng(0)
-    room = np.column_stack([rng.uniform(-1, 1, (4000, 2)), np.zeros(4000)])
+    x, y = np.meshgrid(*[np.arange(-1, 1, 0.04)] * 2)
+    room = np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)])
     points = rng.uniform([-0.3, -0.3, 0.0], [0.3, 0.3, 0.7], (500, 3))
     first = dataclasses.replace(scene.objects[0].observations[0], accumulated=True)
     moved = dataclasses.replace(first, scan=1, T_ref_scan=turn_z(0.7, np.zeros(3), np.array([2.0, 0.0, 0.0])))
