@@ -22,7 +22,7 @@ BESIDE_SPACINGS, MOST_BESIDE_M = (
 AROUND_M = 0.3  # of the footprint: how far apart the background's points lie
 LOWEST_SHARE = 0.005  # of the points lie lower than where the object begins: strays
 UNDER_M = (-0.15, 0.1)  # from there: the floor that it stands on, not one far below what hangs on a wall
-SOLID, OPEN = 0.5, 0.9  # shares of the footprint: up to the first it may be solid, from the second it is not
+SOLID, OPEN = 0.7, 0.95  # shares of the footprint: up to the first it may be solid, from the second it is not
 
 
 def openness(seen_beneath: float) -> float:
