@@ -11,14 +11,10 @@ from scipy.spatial import ConvexHull, KDTree, QhullError
 from more2_jax.geometry.poses import Points, Pose, apply_pose
 
 # Chosen on rooms of validation furniture, docs/developing/notebook/unseen_rise.md.
-CELL_M = (
-    0.05  # a side of the columns that the footprint is divided into: scans hold a point every few centimeters
-)
+CELL_M = 0.05  # a side of the columns that the footprint is divided into
 BESIDE_M = 0.035  # so near a column's middle something was seen beneath,
-BESIDE_SPACINGS, MOST_BESIDE_M = (
-    2.0,
-    0.08,
-)  # or so many distances between neighbors, of a background that was thinned
+BESIDE_SPACINGS = 2.0  # or within so many distances between neighbors, of a background that was thinned,
+MOST_BESIDE_M = 0.08  # but not farther
 AROUND_M = 0.3  # of the footprint: how far apart the background's points lie
 LOWEST_SHARE = 0.005  # of the points lie lower than where the object begins: strays
 UNDER_M = (-0.15, 0.1)  # from there: the floor that it stands on, not one far below what hangs on a wall
