@@ -11,7 +11,8 @@ from scipy.spatial import ConvexHull, KDTree, QhullError
 from more2_jax.geometry.poses import Points, Pose, apply_pose
 
 # Chosen on rooms of validation furniture, docs/developing/notebook/unseen_rise.md.
-CELL_M = 0.05  # a side of the columns that the footprint is divided into
+CELL_M = 0.05  # a side of the columns that the footprint is divided into,
+MOST_COLUMNS = 200  # along a side of it
 BESIDE_M = 0.035  # so near a column's middle something was seen beneath,
 BESIDE_SPACINGS = 2.0  # or within so many distances between neighbors, of a background that was thinned,
 MOST_BESIDE_M = 0.08  # but not farther
@@ -62,6 +63,7 @@ def footprint(points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "c 2"]:
     except (QhullError, ValueError):  # on a line, or fewer than three
         return np.zeros((0, 2))
     low, high = points.min(axis=0), points.max(axis=0)
-    x, y = (np.arange(a + CELL_M / 2, b, CELL_M) for a, b in zip(low, high, strict=True))
+    cell = max(CELL_M, (high - low).max() / MOST_COLUMNS)
+    x, y = (np.arange(a + cell / 2, b, cell) for a, b in zip(low, high, strict=True))
     middles = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
     return middles[(middles @ hull.equations[:, :2].T + hull.equations[:, 2] <= 0).all(axis=1)]

@@ -86,6 +86,12 @@ def test_points_on_a_line_have_no_footprint(points):
     assert share_seen_beneath(points, floor()) == 0.0
 
 
+def test_a_footprint_of_a_kilometer_has_no_more_columns_than_are_needed():
+    corners = np.array([[0.0, 0, 0], [1000, 0, 0], [0, 1000, 0], [1000, 1000, 0]])
+    assert 30_000 < len(footprint(corners[:, :2])) <= 40_000
+    assert share_seen_beneath(corners, floor(spacing=0.1)) < 0.01
+
+
 def test_without_a_background_nothing_is_known():
     for background in (np.zeros((0, 3)), np.zeros((1, 3)), floor() + [100.0, 0, 0]):
         assert share_seen_beneath(table(), background) == 0.0

@@ -52,9 +52,7 @@ class PaddedObject:
     half_width: Float[AnyArray, "*b"] = quantity("length")  # of the query box
     lowest: Float[AnyArray, "*b"] = quantity("length")  # nothing lies below; −∞ where there is no floor
     several: Bool[AnyArray, "*b"] = quantity("invariant")  # whether several scans saw it
-    rise: Float[AnyArray, "*b"] = quantity(
-        "invariant"
-    )  # of the field where nobody looked, a share of the distance
+    rise: Float[AnyArray, "*b"] = quantity("invariant")  # of the field where nobody looked
 
 
 @full_precision
