@@ -10,7 +10,7 @@ from scipy.spatial import ConvexHull, KDTree, QhullError
 
 from more2_jax.geometry.poses import Points, Pose, apply_pose
 
-# Chosen on rooms of validation furniture, docs/developing/notebook/unseen_rise.md.
+# Chosen on rooms of validation furniture, docs/developing/notebook/open_below.md.
 CELL_M = 0.05  # a side of the columns that the footprint is divided into,
 MOST_COLUMNS = 200  # along a side of it
 BESIDE_M = 0.035  # so near a column's middle something was seen beneath,
