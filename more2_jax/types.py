@@ -242,7 +242,7 @@ class AccumulatedObject:
     """An object with the k observations that make up its shape, as refinement and meshing take it; meters, float64.
 
     Points lie in the object's frame. What observation j saw alone is `inverse(poses[j]) @ points[observation == j]`,
-    in the frame of its scan (`geometry.observations`).
+    in the frame of its scan (`geometry.observations`). `background` was no object in the scan that saw it first.
     """
 
     points: Float[np.ndarray, "n 3"]
@@ -252,8 +252,8 @@ class AccumulatedObject:
     normals: Float[np.ndarray, "n 3"] | None = None  # unit, outward; zeros where not known. None: nowhere
     # Of each observation, where its scan's sensors stood, in that scan's frame; (0, 3) where not known.
     sensors: tuple[Float[np.ndarray, "_ 3"], ...]
-    background: Float[np.ndarray, "b 3"] = field(default_factory=NO_POINTS)  # of its first scan, its frame
-    seen_beneath: float = 0.0  # share of its footprint beneath which a scan shows background (`open_below`)
+    background: Float[np.ndarray, "b 3"] = field(default_factory=NO_POINTS)  # in the object's frame
+    seen_beneath: float = 0.0  # largest share of its footprint with background beneath (`open_below`)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -58,10 +58,13 @@ def share_seen_beneath(points: Points, background: Points) -> float:
 
 def footprint(points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "c 2"]:
     """Middles of the columns inside the convex hull; none if the points lie on a line."""
+    nothing = np.zeros((0, 2))
+    if len(points) < 3:
+        return nothing
     try:
         hull = ConvexHull(points)
-    except (QhullError, ValueError):  # on a line, or fewer than three
-        return np.zeros((0, 2))
+    except QhullError:  # on a line
+        return nothing
     low, high = points.min(axis=0), points.max(axis=0)
     cell = max(CELL_M, (high - low).max() / MOST_COLUMNS)
     x, y = (np.arange(a + cell / 2, b, cell) for a, b in zip(low, high, strict=True))

@@ -1,18 +1,11 @@
 """What stands on legs hides little of the floor; what may be solid hides it."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from more2_jax.config import preset
 from more2_jax.geometry.open_below import footprint, most_seen_beneath, openness, share_seen_beneath
 from more2_jax.geometry.poses import apply_pose
-from more2_jax.meshing.object_mesh import unseen_rise
-from more2_jax.types import AccumulatedObject, Embedding
-
-ROBUST = preset("robust", upright=True)
 
 
 def plate(half_x, half_y, height, count=2000, seed=0):
@@ -112,29 +105,3 @@ def test_between_solid_and_open_it_is_gradual():
     np.testing.assert_allclose(
         [openness(x) for x in (0.0, 0.7, 0.75, 0.9, 0.95, 1.0)], [0, 0, 0.2, 0.8, 1, 1]
     )
-
-
-def piece(seen_beneath):
-    code = Embedding(
-        inv=np.zeros(4, np.float32),
-        eqv=np.zeros((3, 4), np.float32),
-        scale=np.float32(1.0),
-        center=np.zeros(3, np.float32),
-        origin=np.zeros(3),
-    )
-    return AccumulatedObject(
-        points=table(),
-        observation=np.zeros(len(table()), int),
-        poses=np.eye(4)[None],
-        embedding=code,
-        sensors=(np.zeros((0, 3)),),
-        seen_beneath=seen_beneath,
-    )
-
-
-def test_the_field_rises_for_what_is_open_where_up_is_known():
-    on_legs, solid = piece(1.0), piece(0.4)
-    assert unseen_rise(on_legs, ROBUST) == ROBUST.meshing.unseen_rise > 0
-    assert unseen_rise(solid, ROBUST) == 0.0
-    assert unseen_rise(on_legs, dataclasses.replace(ROBUST, upright=False)) == 0.0
-    assert unseen_rise(on_legs, preset("paper", upright=True)) == 0.0

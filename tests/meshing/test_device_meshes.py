@@ -64,6 +64,8 @@ def hard(prior):
     up = np.tile([0.0, 0.0, 1.0], (600, 1))
     plane = np.random.default_rng(3).uniform(-0.5, 0.5, (600, 3)) * [1, 1, 0]
     floor = np.random.default_rng(4).uniform(-3, 3, (4000, 3)) * [1, 1, 0] - [0, 0, 0.36] + WORLD_M
+    upper = box_points(1800, 7)
+    upper = upper[upper[:, 2] > 0.1]  # nobody saw what is below
     eyes = (np.array([[3.0, 0, 1], [0, -3, 1]]) + WORLD_M, np.array([[-3.0, 1, 1]]) + WORLD_M)
     make = functools.partial(accumulated, prior)
     return {
@@ -77,7 +79,7 @@ def hard(prior):
         "one place": make(np.zeros((40, 3)) + [0.1, 0.0, 0.0]),
         "floor": make(box_points(700, 5), background=floor),
         "large": make(box_points(2000, 6, 0.01), 2),
-        "on legs": make(box_points(900, 7)[:600], 2, seen_beneath=0.8),
+        "on legs": make(upper, 2, seen_beneath=1.0),
     }
 
 
@@ -133,6 +135,12 @@ def test_meshes_are_the_hosts(prior, hard, made, name):
     assert len(hard) == len(NAMES) and (found is None) == (expected is None) == (name == "one place")
     if expected is not None:
         assert_same(expected, found, WORLD_M, MEAN_CM.get(name, 0.1), 0.015)
+
+
+def test_the_unseen_part_of_what_is_on_legs_is_smaller(prior, hard, made):
+    solid_below = dataclasses.replace(hard["on legs"], seen_beneath=0.0)
+    (expected,) = device_meshes(prior, [solid_below], CONFIG)
+    assert solid(made["on legs"], WORLD_M).volume < 0.98 * solid(expected, WORLD_M).volume
 
 
 def test_nothing_lies_below_the_floor(hard, made):

@@ -9,12 +9,13 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from more2_jax.config import MeshingConfig
+from more2_jax.config import MeshingConfig, preset
 from more2_jax.meshing import extract
 from more2_jax.meshing.device.correction import OrientedPlanes
 from more2_jax.meshing.device.unseen import raised as raised_on_device
 from more2_jax.meshing.extract import extract_mesh
 from more2_jax.meshing.grid import cube
+from more2_jax.meshing.object_mesh import unseen_rise
 from more2_jax.meshing.observed_surface import fit_observed_surface
 from more2_jax.meshing.unseen import (
     BETWEEN,
@@ -24,7 +25,7 @@ from more2_jax.meshing.unseen import (
     share_of_rise,
     winding_number,
 )
-from more2_jax.types import Embedding
+from more2_jax.types import AccumulatedObject, Embedding
 
 REACH = 0.03
 CONFIG = MeshingConfig(coarse_resolution=16, resolution=64, mls_bandwidth=REACH)
@@ -112,6 +113,25 @@ PIECE = Embedding(
     center=np.zeros(3, np.float32),
     origin=np.zeros(3),
 )
+
+
+def test_the_field_rises_for_what_is_open_where_up_is_known():
+    robust, points = preset("robust", upright=True), sphere(100)
+    on_legs, solid = (
+        AccumulatedObject(
+            points=points,
+            observation=np.zeros(100, int),
+            poses=np.eye(4)[None],
+            embedding=PIECE,
+            sensors=(points[:0],),
+            seen_beneath=share,
+        )
+        for share in (1.0, 0.4)
+    )
+    assert unseen_rise(on_legs, robust) == robust.meshing.unseen_rise > 0
+    assert unseen_rise(solid, robust) == 0.0
+    assert unseen_rise(on_legs, dataclasses.replace(robust, upright=False)) == 0.0
+    assert unseen_rise(on_legs, preset("paper", upright=True)) == 0.0
 
 
 @pytest.fixture

@@ -30,7 +30,7 @@ def padded_object(
     half_width: float,
     floor: float | None,
     several: bool,
-    rise: float = 0.0,
+    rise: float,
     sensors: Float[np.ndarray, "n s 3"] | None = None,
     normals: Float[np.ndarray, "n 3"] | None = None,
 ) -> PaddedObject:
