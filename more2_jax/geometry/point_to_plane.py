@@ -19,7 +19,7 @@ from jaxtyping import Bool, Float, Int
 from more2_jax.config import MotionModel
 from more2_jax.geometry.full_precision import full_precision
 from more2_jax.geometry.nearest_grid import NearestGrid, look_up, nearest_grid
-from more2_jax.geometry.points import FAR, nearest_index, thin, transformed
+from more2_jax.geometry.points import FAR, nearest_index, thin
 from more2_jax.types import AnyArray, Sampled, pytree, quantity
 
 ALONG = 0.02  # weight of sliding along the surface, against leaving it
@@ -186,36 +186,44 @@ def spacing(points: Float[Array, "n 3"], mask: Bool[Array, " n"]) -> Float[Array
 
 @pytree
 class Correspondences:
-    """Moved source points and target points that belong together, both ways; target's frame."""
+    """Moved source points and target points that belong together, both ways; target's frame, one component a row."""
 
-    source: Float[Array, "n 3"]
-    target: Float[Array, "n 3"]
-    source_normal: Float[Array, "n 3"]
-    target_normal: Float[Array, "n 3"]
+    source: Float[Array, "3 n"]
+    target: Float[Array, "3 n"]
+    source_normal: Float[Array, "3 n"]
+    target_normal: Float[Array, "3 n"]
     squared: Float[Array, " n"]  # `FAR` where there is none
     opposed: Bool[Array, " n"] | None = None  # a front on a back; None where no sides are known
 
 
 def correspondences(T: jaxlie.SE3, source: Surface, target: Surface) -> Correspondences:
-    """Every sample's nearest point on the other cloud, whichever side it shows."""
-    R = T.rotation().as_matrix()
+    """Every sample's nearest point on the other cloud, whichever side it shows.
+
+    Rows are long, of one component of all points: on CPUs that takes three fifths of the time of rows of three.
+    """
+    R, shift = T.rotation().as_matrix(), T.translation()[:, None]
     s, t = source.sampled, target.sampled
-    points = transformed(T, s.points)
-    there = closest(target, points)
-    back = closest(source, transformed(T.inverse(), t.points))
-    a = jnp.concatenate([points, transformed(T, s.dense[back])])
-    b = jnp.concatenate([t.dense[there], t.points])
+    points = product(R, s.points.T) + shift
+    there = closest(target, points.T)
+    back = closest(source, product(R.T, t.points.T - shift).T)
+    a = jnp.concatenate([points, product(R, s.dense.T[:, back]) + shift], axis=1)
+    b = jnp.concatenate([t.dense.T[:, there], t.points.T], axis=1)
     real = jnp.concatenate([s.mask & t.dense_mask[there], t.mask & s.dense_mask[back]])
-    own = jnp.concatenate([source.normals, source.dense_normals[back]]) @ R.T
-    other = jnp.concatenate([target.dense_normals[there], target.normals])
+    own = product(R, jnp.concatenate([source.normals.T, source.dense_normals.T[:, back]], axis=1))
+    other = jnp.concatenate([target.dense_normals.T[:, there], target.normals.T], axis=1)
     return Correspondences(
         source=a,
         target=b,
         source_normal=own,
         target_normal=other,
-        squared=jnp.where(real, jnp.sum((a - b) ** 2, axis=-1), FAR),
-        opposed=opposed(source, target, there, back, jnp.sum(own * other, axis=-1)),
+        squared=jnp.where(real, jnp.sum((a - b) ** 2, axis=0), FAR),
+        opposed=opposed(source, target, there, back, jnp.sum(own * other, axis=0)),
     )
+
+
+def product(a: Float[Array, "k m"], b: Float[Array, "m n"]) -> Float[Array, "k n"]:
+    """The product of two matrices, in full precision on every device."""
+    return jnp.matmul(a, b, precision="highest")
 
 
 def opposed(
@@ -263,9 +271,8 @@ def normal_equations(
     One of crossed surfaces does not count, nor one of a front and a back where the scans say which they are.
     """
     c = correspondences(T, source, target)
-    # Components first: sums over many points are then products of matrices with long rows, which are fast.
-    points, gap = c.source.T, c.target.T - c.source.T
-    own, other = c.source_normal.T, c.target_normal.T
+    points, gap = c.source, c.target - c.source
+    own, other = c.source_normal, c.target_normal
     agree = jnp.sum(own * other, axis=0)
     normal = other + jnp.where(agree < 0, -1.0, 1.0) * own
     normal = normal / jnp.sqrt(jnp.maximum(jnp.sum(normal**2, axis=0), 1e-12))
@@ -286,7 +293,7 @@ def normal_equations(
 
 def moments(rows: Float[Array, "k n"], weight: Float[Array, " n"]) -> Float[Array, "k k"]:
     """Weighted sums of the products of any two rows."""
-    return jnp.matmul(rows * weight, rows.T, precision="highest")
+    return product(rows * weight, rows.T)
 
 
 def sliding(m: Float[Array, "7 7"]) -> tuple[Float[Array, "6 6"], Float[Array, "6"]]:

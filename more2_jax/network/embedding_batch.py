@@ -15,9 +15,9 @@ from more2_jax.network.prior import Prior, encode
 from more2_jax.network.row_map import chunked
 from more2_jax.types import Embedding, PointCloud
 
-SMALLEST_BATCH = (
-    8  # objects a call: scenes of any size share their compiled programs, and what these take of memory
-)
+SMALLEST_BATCH = 8  # of `padded` and `stack`: scenes of any size share their compiled programs
+# Encoded in a call: many ask for one cloud or two. On accelerators so many times as many.
+CLOUDS_A_CALL, WIDER = 2, 32
 PADDED_TOGETHER = 64  # clouds, a whole number of calls also on accelerators
 
 
@@ -31,13 +31,14 @@ def padded(
 def embed(
     prior: Prior, clouds: Sequence[Rows], normals: Sequence[Rows | None] | None = None
 ) -> list[Embedding]:
-    """One embedding per cloud, `SMALLEST_BATCH` a call; `normals` as `pad_clouds` takes them."""
+    """One embedding per cloud; `normals` as `pad_clouds` takes them."""
     found = list[Embedding]()
     for start in range(0, max(len(clouds), 1), PADDED_TOGETHER):
         some = slice(start, start + PADDED_TOGETHER)
         batch = pad_clouds(clouds[some], MAX_POINTS, None if normals is None else normals[some])
-        codes = chunked(partial(encode, prior), SMALLEST_BATCH, dataclasses.replace(batch, origin=None))
-        found += unstack(dataclasses.replace(codes, origin=batch.origin), len(clouds[some]))
+        batch, origin = dataclasses.replace(batch, origin=None), batch.origin
+        codes = chunked(partial(encode, prior), CLOUDS_A_CALL, batch, WIDER)
+        found += unstack(dataclasses.replace(codes, origin=origin), len(clouds[some]))
     return found
 
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import os
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import jax
@@ -16,8 +18,10 @@ from jaxtyping import Int
 from more2_jax.network.shared_calls import CURRENT
 
 Tree = Any  # of arrays
+Rows = Int[np.ndarray, " k"]
 BLOCK = 256  # queries of a field: 768 points times so many are 0.8 MB
 WIDER = 8  # times as many rows in a call of `chunked` on an accelerator
+CALLS_AT_ONCE = 8  # on a CPU, of its cores; each call takes memory of its own
 
 
 def in_turn(
@@ -77,7 +81,7 @@ def chunked_at(
     function: Callable[[Tree], Tree],
     size: int,
     count: int,
-    taken: Callable[[Int[np.ndarray, " k"]], Tree],
+    taken: Callable[[Rows], Tree],
     wider: int = WIDER,
 ) -> Tree:
     """`chunked` of `count` rows that are made for every call anew: `taken` gives those at some places.
@@ -95,25 +99,71 @@ def chunked_at(
     return jax.tree.map(lambda *x: np.concatenate(x), *found)
 
 
-def _in_calls(
-    function: Callable[[Tree], Tree], size: int, count: int, taken: Callable[[Int[np.ndarray, " k"]], Tree]
-) -> Tree:
+def _in_calls(function: Callable[[Tree], Tree], size: int, count: int, taken: Callable[[Rows], Tree]) -> Tree:
     """`chunked_at` of one row or more, without others' rows."""
-    devices, found = jax.local_devices(), []
-    for wave in range(0, count, size * len(devices)):
-        starts = range(wave, max(min(wave + size * len(devices), count), wave + 1), size)
-        calls = []
-        for device, start in zip(devices, starts, strict=False):
-            at = np.minimum(
-                np.arange(start, start + size), np.where(np.arange(size) < count - start, count, start)
-            )
-            part = taken(at)
-            calls.append(function(part if len(devices) == 1 else jax.device_put(part, device)))
-            if traced(calls[-1]):  # by what the function closes over, or as part of a larger program
-                return function(taken(np.arange(count)))
-        for start, call in zip(starts, calls, strict=True):
-            found.append(jax.tree.map(lambda x, n=count - start: x[:n], jax.device_get(call)))
-    return jax.tree.map(lambda *x: np.concatenate(x), *found) if len(found) > 1 else found[0]
+    places = [_filled(start, size, count) for start in range(0, count, size)]
+    devices, rows = jax.local_devices(), taken(places[0])
+    first = function(rows if len(devices) == 1 else jax.device_put(rows, devices[0]))
+    if traced(first):  # by what the function closes over, or as part of a larger program
+        return function(taken(np.arange(count)))
+    calls = _on_devices if len(devices) > 1 else _on_cores if _cores() > 1 else _in_order
+    *found, last = calls(function, taken, places[1:], first)
+    last = jax.tree.map(lambda x: x[: count - places[-1][0]], last)
+    return jax.tree.map(lambda *x: np.concatenate(x), *found, last) if found else last
+
+
+def _filled(start: int, size: int, count: int) -> Rows:
+    """The rows of the call that begins at `start`, filled up with its first."""
+    at = np.arange(start, start + size)
+    return np.where(at < count, at, start)
+
+
+# Results of a first call, which is made, and of the others, in order, on the host.
+
+
+def _in_order(
+    function: Callable[[Tree], Tree], taken: Callable[[Rows], Tree], places: Sequence[Rows], first: Tree
+) -> Iterator[Tree]:
+    yield jax.device_get(first)
+    yield from (jax.device_get(function(taken(at))) for at in places)
+
+
+def _on_devices(
+    function: Callable[[Tree], Tree], taken: Callable[[Rows], Tree], places: Sequence[Rows], first: Tree
+) -> Iterator[Tree]:
+    """The devices take calls in turn, side by side."""
+    devices, begun = jax.local_devices(), [first]
+    for n, at in enumerate(places, start=1):
+        begun.append(function(jax.device_put(taken(at), devices[n % len(devices)])))
+        if len(begun) == len(devices):
+            yield from map(jax.device_get, begun)
+            begun = []
+    yield from map(jax.device_get, begun)
+
+
+def _on_cores(
+    function: Callable[[Tree], Tree], taken: Callable[[Rows], Tree], places: Sequence[Rows], first: Tree
+) -> Iterator[Tree]:
+    """The cores take calls in turn, side by side: programs that keep to the caches keep one core busy each."""
+    wide = jax.config.jax_enable_x64  # pyright: ignore[reportAttributeAccessIssue]
+    precision = jax.config.jax_default_matmul_precision  # pyright: ignore[reportAttributeAccessIssue]
+
+    def call(at: Rows) -> Tree:
+        with jax.enable_x64(wide), jax.default_matmul_precision(precision):  # JAX keeps these by thread
+            return jax.device_get(function(taken(at)))
+
+    yield jax.device_get(first)  # compiled once
+    if places:
+        with ThreadPoolExecutor(min(_cores(), len(places))) as pool:
+            yield from pool.map(call, places)
+
+
+def _cores() -> int:
+    """How many calls are made at a time: 1 on accelerators, and where scenes keep the cores busy already."""
+    if jax.default_backend() != "cpu" or CURRENT.get() is not None:
+        return 1
+    allowed = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return min(CALLS_AT_ONCE, allowed)
 
 
 def _of_no_rows(function: Callable[[Tree], Tree], rows: Tree) -> Tree:

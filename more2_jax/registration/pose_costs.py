@@ -39,7 +39,7 @@ def misfits_both_ways(
     """
     c = correspondences(T, source, target)
     gap, count = c.target - c.source, len(source.normals)
-    off = sum(jnp.sum(gap * normal, axis=-1) ** 2 for normal in (c.source_normal, c.target_normal)) / 2
+    off = sum(jnp.sum(gap * normal, axis=0) ** 2 for normal in (c.source_normal, c.target_normal)) / 2
     near = (1 - POINT_SHARE) * off + POINT_SHARE * c.squared
     real, finite = c.squared < FAR, jnp.isfinite(T.wxyz_xyz).all()
     shares = jnp.zeros_like(near)

@@ -34,7 +34,10 @@ from more2_jax.types import AnyArray, Embedding, LocalBatch, Sight, pytree, quan
 
 # Calls of one shape, so that scenes share compiled programs, and small, so that few fillers are worked on.
 OBJECTS_A_CALL = 1  # prepared in a call, on CPUs one after the other anyway
-PAIRS_A_CALL = 8  # searched together: what fits a small CPU's caches
+PAIRS_A_CALL, WIDER = (
+    4,
+    16,
+)  # searched in a call, on CPUs one after the other; on accelerators so many times as many
 # In any orientation every start is aligned for a third of the steps, and the best third of them go on: as right as all
 # of them for two thirds of the work (docs/developing/notebook/speed_scene.md). Upright there are fewer, of which all
 # have all steps.
@@ -122,7 +125,7 @@ def search_poses(
     one_call = partial(_search_poses, search=search, motion=motion)
     source, target = searched(source), searched(target)
     if rows is None:
-        return chunked(one_call, PAIRS_A_CALL, (source, target, stayed))
+        return chunked(one_call, PAIRS_A_CALL, (source, target, stayed), WIDER)
 
     def taken(at: Int[np.ndarray, " k"]) -> tuple[AlignableObject, AlignableObject, jaxlie.SE3]:
         return *rows_taken((source, target), rows[at]), jax.tree.map(lambda x: x[at], stayed)
@@ -131,7 +134,7 @@ def search_poses(
         one_call,
         len(rows),
         taken,
-        lambda at: chunked_at(one_call, PAIRS_A_CALL, len(at), lambda some: taken(at[some])),
+        lambda at: chunked_at(one_call, PAIRS_A_CALL, len(at), lambda some: taken(at[some]), WIDER),
     )
 
 
@@ -153,7 +156,11 @@ def _search_poses(
     def one(pair: tuple[AlignableObject, AlignableObject, jaxlie.SE3]) -> FoundPoses:
         return search_pair(*pair, search, motion)
 
-    return jax.lax.map(one, pairs, batch_size=PAIRS_A_CALL)
+    if (
+        jax.default_backend() == "cpu"
+    ):  # one by one: what all starts of a pair are compared by stays in the caches
+        return jax.lax.map(one, pairs)
+    return jax.vmap(one)(pairs)
 
 
 def search_pair(

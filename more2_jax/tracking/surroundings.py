@@ -15,6 +15,7 @@ from scipy.spatial import KDTree
 from more2_jax.geometry.near_points import NearPoints
 from more2_jax.geometry.poses import Points, apply_pose
 from more2_jax.geometry.room_planes import room_planes, within
+from more2_jax.network.remembered_rows import once
 from more2_jax.tracking.objects import accumulated, points_of
 from more2_jax.types import ScanRecord, SceneObject
 
@@ -45,14 +46,26 @@ def surroundings(clouds: Sequence[Points], background: Points) -> list[Points]:
     owner = np.repeat(np.arange(len(few)), [len(c) for c in few])
     others, room = np.concatenate(few), NearPoints(np.concatenate([background, *clouds]))
     walls = NearPoints(background)
-    return [around(c, walls, others[owner != k], room) for k, c in enumerate(clouds)]
+    near = [once(background_around, (c, background), c, walls, room) for c in clouds]
+    beside = [within(KDTree(c), others[owner != k], reach_m(c)) for k, c in enumerate(clouds)]
+    return [np.concatenate(both) for both in zip(near, beside, strict=True)]
 
 
 def around(cloud: Points, background: NearPoints, others: Points, room: NearPoints) -> Points:
     """Points near a cloud, of the background without floor and walls, and of others; `room` is all of the scan."""
-    radius = np.linalg.norm(cloud - cloud.mean(axis=0), axis=1).max()
-    tree, reach = KDTree(cloud), max(REACH * radius, LEAST_REACH_M)
-    near, beside = (within(tree, p, reach) for p in (background, others))
+    beside = within(KDTree(cloud), others, reach_m(cloud))
+    return np.concatenate([background_around(cloud, background, room), beside])
+
+
+def background_around(cloud: Points, background: NearPoints, room: NearPoints) -> Points:
+    """Points of the background near a cloud, without floor and walls; `room` is all of the scan."""
+    near = within(KDTree(cloud), background, reach_m(cloud))
     for plane in room_planes(cloud, background, room):
         near = near[~plane.is_near(near)]
-    return np.concatenate([near, beside])
+    return near
+
+
+def reach_m(cloud: Points) -> float:
+    """How near to a cloud lies what may be a part of it."""
+    radius = float(np.linalg.norm(cloud - cloud.mean(axis=0), axis=1).max())
+    return max(REACH * radius, LEAST_REACH_M)
