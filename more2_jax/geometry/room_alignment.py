@@ -22,8 +22,9 @@ from more2_jax.geometry.voxels import voxel_means, voxel_normals
 
 VOXEL_M = 0.05  # clouds are compared at this spacing, whatever theirs is
 NEIGHBORS = 16  # of a voxel's normal
-REACHES_M = (0.3, 0.2, 0.1, 0.06)  # of correspondences, from far to near; `ROUNDS` each
+REACHES_M = (0.3, 0.2, 0.1, 0.06)  # of correspondences, from far to near; at most `ROUNDS` each
 ROUNDS = 6
+STILL = 1e-3  # radians and meters: after a smaller step the next reach has its turn
 PARALLEL = 0.8  # cosine between the normals of what corresponds
 FITS_M = 0.06  # a voxel is where the other scan has it: walls are 1 to 3 cm thick in either
 LEAST_FACING = 0.05  # share of the voxels that face a direction which counts
@@ -67,13 +68,16 @@ def _refined(a: RoomShape, b: RoomShape, T_a_b: Pose, reaches_m: Sequence[float]
     points, normals = b.points[rows], b.normals[rows]
     for reach_m in reaches_m:
         for _ in range(ROUNDS):
-            T_a_b = _step(a, apply_pose(T_a_b, points), _turned(T_a_b, normals), reach_m) @ T_a_b
+            step = _step(a, apply_pose(T_a_b, points), _turned(T_a_b, normals), reach_m)
+            T_a_b = step @ T_a_b
+            if np.abs(step - np.eye(4)).max() < STILL:
+                break
     return T_a_b
 
 
 def _step(a: RoomShape, points: Points, normals: Points, reach_m: float) -> Pose:
     """The motion that takes the points closer to the tangent planes of what they lie nearest."""
-    distance, near = map(np.asarray, a.tree.query(points, distance_upper_bound=reach_m))
+    distance, near = map(np.asarray, a.tree.query(points, distance_upper_bound=reach_m, workers=-1))
     near = np.minimum(near, len(a.points) - 1)
     rows = np.isfinite(distance) & (np.abs(np.einsum("ni,ni->n", normals, a.normals[near])) > PARALLEL)
     if rows.sum() < 6:
@@ -168,7 +172,9 @@ def _on_other(a: RoomShape, b: RoomShape, T_a_b: Pose) -> tuple[float, float]:
     """
     normals = _turned(T_a_b, b.normals)
     # Bounded: of a pose that does not fit most lies far off, where a search would be long.
-    distance, near = map(np.asarray, a.tree.query(apply_pose(T_a_b, b.points), distance_upper_bound=FITS_M))
+    distance, near = map(
+        np.asarray, a.tree.query(apply_pose(T_a_b, b.points), distance_upper_bound=FITS_M, workers=-1)
+    )
     near = np.minimum(near, len(a.points) - 1)
     parallel = np.abs(np.einsum("ni,ni->n", normals, a.normals[near])) > PARALLEL
     on = (distance < FITS_M) & parallel
