@@ -7,10 +7,12 @@ import jax.numpy as jnp
 import jaxlie
 import numpy as np
 import pytest
+from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from more2_jax.geometry.point_to_plane import (
     align,
+    correspondences,
     least_axis,
     moments,
     pose_covariance,
@@ -102,6 +104,27 @@ def test_points_are_moved_as_jaxlie_moves_them(degrees):
     T = jaxlie.SE3.from_rotation_and_translation(turn, jnp.asarray(rng.normal(size=3), jnp.float32))
     points = jnp.asarray(rng.normal(size=(9, 3)), jnp.float32)
     np.testing.assert_allclose(transformed(T, points), T @ points, atol=1e-6)
+
+
+@pytest.mark.parametrize("degrees", [0.0, 33.0, 180.0])
+def test_what_corresponds_is_what_a_search_tree_finds_nearest(degrees):
+    rng = np.random.default_rng(4)
+    a, b = (as_surface(box_points(rng, count=n)[0]) for n in (200, 90))
+    R, shift = Rotation.from_euler("zx", [degrees, 2], degrees=True), np.array([0.1, -0.05, 0.02])
+    turn = jaxlie.SO3.from_matrix(jnp.asarray(R.as_matrix(), jnp.float32))
+    T = jaxlie.SE3.from_rotation_and_translation(turn, jnp.asarray(shift, jnp.float32))
+    c = correspondences(T, a, b)
+    moved, other = R.apply(np.asarray(a.sampled.points)) + shift, np.asarray(b.sampled.points)
+    distances = [KDTree(y).query(x)[0] for x, y in ((moved, other), (other, moved))]
+    np.testing.assert_allclose(np.sqrt(c.squared), np.concatenate(distances), atol=2e-3)
+    # Whose normals they are: those of the points they stand beside.
+    for cloud, normals, points, at in (
+        (moved, R.apply(np.asarray(a.normals)), c.source, c.source_normal),
+        (other, np.asarray(b.normals), c.target, c.target_normal),
+    ):
+        off, row = KDTree(cloud).query(np.asarray(points).T)
+        assert off.max() < 1e-5
+        np.testing.assert_allclose(np.asarray(at).T, normals[row], atol=1e-5)
 
 
 @pytest.mark.parametrize("motion", ["free", "upright"])

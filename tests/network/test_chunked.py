@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from more2_jax.network import row_map
 from more2_jax.network.row_map import chunked, chunked_at
 
 SIZE = 4
@@ -48,6 +49,18 @@ def test_rows_made_call_by_call_are_those_made_at_once(program):
     for name, value in chunked(program, SIZE, {k: v[pairs] for k, v in rows.items()}).items():
         np.testing.assert_array_equal(found[name], value)
     assert asked == [SIZE] * 3
+
+
+@pytest.mark.parametrize("cores", [1, 3])
+def test_calls_side_by_side_are_in_order_and_of_one_program(program, monkeypatch, cores):
+    monkeypatch.setattr(row_map, "_cores", lambda: cores)
+    rows = rows_of(43)
+    with jax.enable_x64(True):  # which JAX keeps by thread, as it does the precision of products
+        rows = {"x": rows["x"].astype(np.float64), "flag": rows["flag"]}
+        found = chunked(program, SIZE, rows)
+    assert found["square"].dtype == np.float64
+    np.testing.assert_array_equal(found["square"], rows["x"] ** 2)
+    assert program._cache_size() == 1
 
 
 def test_of_no_rows_there_is_nothing_in_the_shapes_of_one():

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from more2_jax.network.remembered_rows import RememberedRows, only_new, rows_remembered
+from more2_jax.network.remembered_rows import RememberedRows, once, only_new, rows_remembered
 
 ROWS = {"a": np.arange(12.0).reshape(6, 2), "b": np.arange(6, dtype=np.int32)}
 
@@ -51,6 +51,22 @@ def test_only_rows_that_changed_are_computed_anew_whatever_their_order():
         same(counted.of(other), squares(other))
         same(counted.of(other), squares(other))
     assert counted.counts == [6, 2]
+
+
+def test_what_equal_arrays_tell_is_computed_once():
+    asked = []
+
+    def doubled(x):
+        asked.append(x)
+        return 2 * x
+
+    x = np.arange(3.0)
+    with rows_remembered():
+        for y in (x, x.copy(), x + 1, x):
+            np.testing.assert_array_equal(once(doubled, (y,), y), 2 * y)
+        assert len(asked) == 2
+    once(doubled, (x,), x)
+    assert len(asked) == 3  # nothing is remembered outside
 
 
 def test_a_row_that_differs_in_one_bit_is_another_row():
