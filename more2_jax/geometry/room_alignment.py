@@ -39,6 +39,7 @@ YAWS = 4  # turns tried, each with its half turn
 SHIFTS = 3  # for each
 CELL_M = 0.1  # of the maps from above
 ROUGH_VOXELS = 2500  # while many poses are tried
+THREADS = 4  # of a search in a tree: few, as scenes may be worked on side by side
 MOST_VOXELS = 8000  # at even steps, of the moving scan
 
 
@@ -77,7 +78,7 @@ def _refined(a: RoomShape, b: RoomShape, T_a_b: Pose, reaches_m: Sequence[float]
 
 def _step(a: RoomShape, points: Points, normals: Points, reach_m: float) -> Pose:
     """The motion that takes the points closer to the tangent planes of what they lie nearest."""
-    distance, near = map(np.asarray, a.tree.query(points, distance_upper_bound=reach_m, workers=-1))
+    distance, near = map(np.asarray, a.tree.query(points, distance_upper_bound=reach_m, workers=THREADS))
     near = np.minimum(near, len(a.points) - 1)
     rows = np.isfinite(distance) & (np.abs(np.einsum("ni,ni->n", normals, a.normals[near])) > PARALLEL)
     if rows.sum() < 6:
@@ -173,7 +174,7 @@ def _on_other(a: RoomShape, b: RoomShape, T_a_b: Pose) -> tuple[float, float]:
     normals = _turned(T_a_b, b.normals)
     # Bounded: of a pose that does not fit most lies far off, where a search would be long.
     distance, near = map(
-        np.asarray, a.tree.query(apply_pose(T_a_b, b.points), distance_upper_bound=FITS_M, workers=-1)
+        np.asarray, a.tree.query(apply_pose(T_a_b, b.points), distance_upper_bound=FITS_M, workers=THREADS)
     )
     near = np.minimum(near, len(a.points) - 1)
     parallel = np.abs(np.einsum("ni,ni->n", normals, a.normals[near])) > PARALLEL

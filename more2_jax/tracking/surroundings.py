@@ -46,6 +46,7 @@ def surroundings(clouds: Sequence[Points], background: Points) -> list[Points]:
     owner = np.repeat(np.arange(len(few)), [len(c) for c in few])
     others, room = np.concatenate(few), NearPoints(np.concatenate([background, *clouds]))
     walls = NearPoints(background)
+    # All of the scan is the same, however its masks are joined or divided.
     near = [once(background_around, (c, background), c, walls, room) for c in clouds]
     beside = [within(KDTree(c), others[owner != k], reach_m(c)) for k, c in enumerate(clouds)]
     return [np.concatenate(both) for both in zip(near, beside, strict=True)]
