@@ -65,10 +65,10 @@ def in_blocks(function: Callable[[Array], Array], rows: Array, size: int = BLOCK
 def chunked(function: Callable[[Tree], Tree], size: int, rows: Tree, wider: int = WIDER) -> Tree:
     """`function` of `rows` (leading axis b), in calls of `size` rows each: one compiled program whatever b is.
 
-    Accelerators take `wider` times as many; several local devices, or a CPU's cores, take calls in turn, side by side. The last call is
-    filled up with its first row; of no rows there is none. Where scenes are worked on side by side (`shared_calls`),
-    the last call is made with rows of other scenes. Where anything is traced, the number of rows is part of a
-    larger program anyway: they go in one call. Results are host arrays, but for traced ones.
+    Accelerators take `wider` times as many; several local devices, or a CPU's cores, take calls in turn, side by side.
+    The last call is filled up with its first row; of no rows there is none. Where scenes are worked on side by side
+    (`shared_calls`), the last call is made with rows of other scenes. Where anything is traced, the number of rows is
+    part of a larger program anyway: they go in one call. Results are host arrays, but for traced ones.
     """
     if traced(rows):
         return function(rows)
