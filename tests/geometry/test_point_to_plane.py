@@ -113,7 +113,7 @@ def test_what_corresponds_is_what_a_search_tree_finds_nearest(degrees):
     R, shift = Rotation.from_euler("zx", [degrees, 2], degrees=True), np.array([0.1, -0.05, 0.02])
     turn = jaxlie.SO3.from_matrix(jnp.asarray(R.as_matrix(), jnp.float32))
     T = jaxlie.SE3.from_rotation_and_translation(turn, jnp.asarray(shift, jnp.float32))
-    c = correspondences(T, a, b)
+    c = jax.jit(correspondences)(T, a, b)
     moved, other = R.apply(np.asarray(a.sampled.points)) + shift, np.asarray(b.sampled.points)
     distances = [KDTree(y).query(x)[0] for x, y in ((moved, other), (other, moved))]
     np.testing.assert_allclose(np.sqrt(c.squared), np.concatenate(distances), atol=2e-3)
