@@ -104,9 +104,11 @@ def once(function: Callable[..., Tree], told_by: Sequence[np.ndarray], *argument
     if programs is None:
         return function(*arguments)
     memory, key = programs.of(function), digest(told_by)
-    if key not in memory.found:
-        memory.keep(key, function(*arguments))
-    return memory.found[key]
+    if key in memory.found:
+        return memory.found[key]
+    result = function(*arguments)
+    memory.keep(key, result)  # one too large to be held is not
+    return result
 
 
 def row_of(results: Tree, row: int) -> Tree:

@@ -34,10 +34,8 @@ from more2_jax.types import AnyArray, Embedding, LocalBatch, Sight, pytree, quan
 
 # Calls of one shape, so that scenes share compiled programs, and small, so that few fillers are worked on.
 OBJECTS_A_CALL = 1  # prepared in a call, on CPUs one after the other anyway
-PAIRS_A_CALL, WIDER = (
-    4,
-    16,
-)  # searched in a call, on CPUs one after the other; on accelerators so many times as many
+# Searched in a call, on CPUs one after the other; on accelerators so many times as many.
+PAIRS_A_CALL, WIDER = 4, 16
 # In any orientation every start is aligned for a third of the steps, and the best third of them go on: as right as all
 # of them for two thirds of the work (docs/developing/notebook/speed_scene.md). Upright there are fewer, of which all
 # have all steps.
@@ -156,9 +154,7 @@ def _search_poses(
     def one(pair: tuple[AlignableObject, AlignableObject, jaxlie.SE3]) -> FoundPoses:
         return search_pair(*pair, search, motion)
 
-    if (
-        jax.default_backend() == "cpu"
-    ):  # one by one: what all starts of a pair are compared by stays in the caches
+    if jax.default_backend() == "cpu":  # what the starts of one pair are compared by stays in the caches
         return jax.lax.map(one, pairs)
     return jax.vmap(one)(pairs)
 

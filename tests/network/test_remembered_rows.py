@@ -69,6 +69,20 @@ def test_what_equal_arrays_tell_is_computed_once():
     assert len(asked) == 3  # nothing is remembered outside
 
 
+def test_what_is_too_large_to_be_held_is_computed_again():
+    x, asked = np.arange(3.0), []
+
+    def doubled(x):
+        asked.append(x)
+        return 2 * x
+
+    with rows_remembered() as programs:
+        programs.most_bytes = x.nbytes - 1
+        for _ in range(2):
+            np.testing.assert_array_equal(once(doubled, (x,), x), 2 * x)
+    assert len(asked) == 2
+
+
 def test_a_row_that_differs_in_one_bit_is_another_row():
     counted, other = Counted(), {name: x.copy() for name, x in ROWS.items()}
     other["a"][2, 0] = np.nextafter(other["a"][2, 0], 9.0)
