@@ -128,7 +128,7 @@ def who_is_who(
             elif mend is without_unfound:
                 break
         masks, old, new, found = known
-        return masks, old, new, with_left_over(found, config).without_seen()
+        return masks, old, new, with_left_over(found, config, rooms).without_seen()
 
 
 def mends_of_masks(scene: LivingScene, scan: Scan) -> Iterator[Mend]:

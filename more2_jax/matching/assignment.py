@@ -7,7 +7,8 @@ object nor an instance, nor are linked by others that do, are chosen independent
 from __future__ import annotations
 
 from collections import defaultdict
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -43,6 +44,13 @@ class LogOdds:
         found = np.full(self.shape, NEVER)
         found[tuple(self.pairs.T)] = self.value
         return found
+
+    def less(self, lost: Mapping[tuple[int, int], float]) -> LogOdds:
+        """The same, less what some of the pairs lose."""
+        value = self.value.copy()
+        if lost:
+            value[self.rows_of(np.array(list(lost)))] -= list(lost.values())
+        return replace(self, value=value)
 
     def rows_of(self, pairs: Chosen) -> Int[np.ndarray, " q"]:
         """Where pairs are listed."""

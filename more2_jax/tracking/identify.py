@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from jaxtyping import Float
 
 from more2_jax.config import CodeMatcher, EvidenceMatcher, SceneConfig
 from more2_jax.matching.assignment import Chosen, LogOdds, assign, interchangeable, unmatched
@@ -18,9 +19,12 @@ from more2_jax.network.prior import Prior
 from more2_jax.tracking.objects import SCENE_FRAME
 from more2_jax.tracking.rooms import Rooms
 from more2_jax.tracking.scan_frame import common_frame
+from more2_jax.tracking.still_standing import lost_by_standing
 from more2_jax.types import Frame, ObservedObject, SceneObject
 
-NO_ROOMS = Rooms()
+Lost = Mapping[tuple[int, int], float]  # of log odds, by pairs (object, instance)
+
+NO_ROOMS, NOTHING_LOST = Rooms(), dict[tuple[int, int], float]()
 # Of log odds, in any orientation, for pairs of what is left over: objects stay more often than the weights were fitted
 # for, docs/developing/notebook/matching_any_orientation.md.
 LEFT_OVER = 1.0
@@ -44,9 +48,10 @@ class Identified:
     gone: dict[int, float] = field(default_factory=dict)  # object → probability that it is not in the scan
     new: dict[int, float] = field(default_factory=dict)  # instance → probability that it is no known object
     frame: Frame = SCENE_FRAME  # of the scan
-    aligned: AlignedPairs | None = (
-        None  # the pairs that surfaces were compared of, for registration to go on with
-    )
+    # The pairs that surfaces were compared of, for registration to go on with,
+    aligned: AlignedPairs | None = None
+    # and what (object, instance) lost of log odds, as both still stand where they stood.
+    lost: Lost = field(default_factory=dict)
 
     def without_seen(self) -> Identified:
         """What registration needs to know: no longer what scans show to be empty."""
@@ -91,11 +96,34 @@ def by_evidence(
 ) -> Identified:
     """The assignment that surfaces find likeliest, with probabilities, and the frame of the scan."""
     frame, weighed = common_frame(prior, old, new, matcher, config.motion, rooms)
-    pairs = assign(weighed.odds, motion_odds(weighed.aligned, frame.T_scene_scan, matcher, config.motion))
-    return as_told(weighed.odds, pairs, frame, weighed.aligned, config)
+    aligned = weighed.aligned
+    motion = motion_odds(aligned, frame.T_scene_scan, matcher, config.motion)
+    pairs, lost = without_standing(
+        lambda lost: assign(weighed.odds.less(lost), motion),
+        lambda moved: lost_by_standing(aligned, moved, frame, rooms),
+    )
+    return as_told(
+        weighed.odds.less(lost), pairs, Identified(frame=frame, aligned=aligned, lost=lost), config
+    )
 
 
-def with_left_over(identified: Identified, config: SceneConfig) -> Identified:
+def without_standing(
+    chosen: Callable[[Lost], Chosen],
+    standing: Callable[[Chosen], Float[np.ndarray, " q"]],
+    lost: Lost = NOTHING_LOST,
+) -> tuple[Chosen, Lost]:
+    """An assignment in which what still stands where it stood has lost what speaks against its having moved.
+
+    `chosen`: the assignment when some pairs have lost log odds. `standing`: what those that it holds are to lose.
+    """
+    asked, found = dict(lost), chosen(lost)
+    while new := [pair for pair in map(tuple, found.tolist()) if pair not in asked]:
+        asked |= dict(zip(new, standing(np.array(new)).tolist(), strict=True))
+        found = chosen(asked)
+    return found, {pair: less for pair, less in asked.items() if less}
+
+
+def with_left_over(identified: Identified, config: SceneConfig, rooms: Rooms = NO_ROOMS) -> Identified:
     """The same with pairs of what was left over that lie in one place.
 
     In any orientation also those that are nearly as likely one object as not. To be asked when masks are mended: until
@@ -113,20 +141,24 @@ def with_left_over(identified: Identified, config: SceneConfig) -> Identified:
     sure = np.maximum(odds.value, even_odds(search, config.motion) + IN_PLACE)
     odds = replace(odds, value=np.where(here, sure, odds.value))
     rows = here if upright else rows
-    left = LogOdds(pairs=odds.pairs[rows], value=odds.value[rows] + LEFT_OVER, shape=odds.shape)
-    motion = motion_odds(aligned, frame.T_scene_scan, config.matching, config.motion)
-    more = assign(left, motion[rows])
+    motion = motion_odds(aligned, frame.T_scene_scan, config.matching, config.motion)[rows]
+
+    def left(lost: Lost) -> Chosen:
+        value = odds.less(lost).value[rows] + LEFT_OVER
+        return assign(LogOdds(pairs=odds.pairs[rows], value=value, shape=odds.shape), motion)
+
+    more, lost = without_standing(
+        left, lambda moved: lost_by_standing(aligned, moved, frame, rooms), identified.lost
+    )
     if not len(more):
         return identified
     found = np.array([(f.object, f.instance) for f in identified.found], int).reshape(-1, 2)
     pairs = np.concatenate([found, more])
-    return as_told(odds, pairs[np.lexsort(pairs.T[::-1])], frame, aligned, config)
+    return as_told(odds.less(lost), pairs[np.lexsort(pairs.T[::-1])], replace(identified, lost=lost), config)
 
 
-def as_told(
-    odds: LogOdds, pairs: Chosen, frame: Frame, aligned: AlignedPairs, config: SceneConfig
-) -> Identified:
-    """An assignment with its probabilities."""
+def as_told(odds: LogOdds, pairs: Chosen, known: Identified, config: SceneConfig) -> Identified:
+    """An assignment with its probabilities, of what is `known` of the scan."""
     assert isinstance(config.matching, EvidenceMatcher)
     copies = interchangeable(odds, pairs)
     chance = probability(odds.value, config.matching.search, config.motion)
@@ -135,7 +167,7 @@ def as_told(
         Found(object=int(k), instance=int(i), score=float(p), interchangeable=c)
         for (k, i), p, c in zip(pairs, chance[odds.rows_of(pairs)], copies, strict=True)
     )
-    return Identified(found=found, gone=gone, new=fresh, frame=frame, aligned=aligned)
+    return replace(known, found=found, gone=gone, new=fresh)
 
 
 def chances(

@@ -109,18 +109,22 @@ def cannot_tell(
     return [seen < LOOKED_AT or still >= STILL_THERE for seen, still in zip(shares, there, strict=True)]
 
 
-def shares_still_there(places: Sequence[Points], clouds: Iterator[Points], near_m: float) -> list[float]:
+def shares_still_there(
+    places: Sequence[Points], clouds: Iterator[Points], near_m: float, but: Sequence[int] | None = None
+) -> list[float]:
     """Shares of places that lie on surfaces of a scan other than floor and walls; the first cloud is its background.
 
-    Of the other clouds, one after the other, only what lies about the places is held.
+    Of the other clouds, one after the other, only what lies about the places is held. `but`: of each place, the number
+    of the cloud, background aside, that does not count.
     """
     background = NearPoints(next(clouds))
     boxes = [(p.min(axis=0) - near_m, p.max(axis=0) + near_m) for p in places]
     beside: list[list[Points]] = [[np.zeros((0, 3))] for _ in places]
-    for cloud in (c for c in clouds if len(c)):
+    but = [-1] * len(places) if but is None else but
+    for n, cloud in ((n, c) for n, c in enumerate(clouds) if len(c)):
         low, high = cloud.min(axis=0), cloud.max(axis=0)
-        for (first, last), parts in zip(boxes, beside, strict=True):
-            if (low <= last).all() and (first <= high).all():
+        for (first, last), parts, own in zip(boxes, beside, but, strict=True):
+            if n != own and (low <= last).all() and (first <= high).all():
                 parts.append(cloud[((cloud >= first) & (cloud <= last)).all(axis=1)])
     shares = list[float]()
     for place, parts in zip(places, beside, strict=True):

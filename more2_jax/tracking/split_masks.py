@@ -28,7 +28,8 @@ Parts = dict[
 NEAR = 0.08  # shares of the object's radius: what lies so near its points lies on it
 NEAR_M = 0.03  # and at least so near: what fusion and drift leave of a surface
 LEAST_ON = 0.6  # share of a part that must lie on the whole
-WORST_MISFIT = 0.5  # of the pose by which parts are laid onto the whole
+WORST_MISFIT = 0.5  # of the pose by which parts are laid onto the whole,
+ON_AT_REST = 0.9  # if not so much of the part that was found lies on the whole where nothing moved
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,12 +94,13 @@ def parts_in_scan(
     left = sorted(set(range(len(instances))) - {i for _, i in found})
     balls = Balls.around([instances[i].points for i in left])
     parts: Parts = {}
-    for n, ((k, _), pose) in enumerate(zip(found, seen, strict=True)):
-        if not trusted(pose):
-            continue
+    for n, ((k, own), pose) in enumerate(zip(found, seen, strict=True)):
         whole = accumulated_points(objects[k])
-        for i in (left[r] for r in balls.reach(whole, pose.T_ref_scan)):
-            share = share_on(whole, apply_pose(pose.T_ref_scan, instances[i].points))
+        T_ref_scan = laid_by(objects[k], whole, instances[own], pose)
+        if T_ref_scan is None:
+            continue
+        for i in (left[r] for r in balls.reach(whole, T_ref_scan)):
+            share = share_on(whole, apply_pose(T_ref_scan, instances[i].points))
             if share >= max(LEAST_ON, parts.get(i, (0, 0.0))[1]):
                 parts[i] = n, share
     return parts
@@ -119,9 +121,10 @@ def parts_known(
     parts: Parts = {}
     for n, ((k, i), pose) in enumerate(zip(found, seen, strict=True)):
         last = objects[k].observations[-1]
-        if not trusted(pose):
+        T_ref_scan = laid_by(objects[k], accumulated_points(objects[k]), instances[i], pose)
+        if T_ref_scan is None:
             continue
-        whole = apply_pose(place_of(last) @ pose.T_ref_scan, instances[i].points)
+        whole = apply_pose(place_of(last) @ T_ref_scan, instances[i].points)
         near = (left[r] for r in balls.reach(whole))
         for q in (q for q in near if [s.scan for s in objects[q].observations] == [last.scan]):
             share = share_on(whole, there(objects[q]))
@@ -156,9 +159,19 @@ class Balls:
         return np.flatnonzero(np.linalg.norm(beyond, axis=1) <= self.radius_m + reach_m(whole)).tolist()
 
 
-def trusted(pose: Observation) -> bool:
-    """Whether a pose may say what lies on what."""
-    return pose.converged and pose.misfit <= WORST_MISFIT
+def laid_by(o: SceneObject, whole: Points, instance: Instance, pose: Observation) -> Pose | None:
+    """T_ref_scan that may say what lies on an object, of which all points known are given; None of none.
+
+    The pose found of an instance. A part fits a whole badly however right its pose is: if it lies on the object where
+    nothing moved, it stayed there.
+    """
+    if pose.converged and pose.misfit <= WORST_MISFIT:
+        return pose.T_ref_scan
+    if pose.frame.unknown:
+        return None
+    at_rest: Pose = np.linalg.inv(place_of(o.observations[-1])) @ pose.frame.T_scene_scan
+    on = share_on(whole, apply_pose(at_rest, instance.points))
+    return at_rest if on >= ON_AT_REST else None
 
 
 def share_on(whole: Points, part: Points) -> float:

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Collection
 
 import numpy as np
 import pytest
 
 from more2_jax.config import preset
-from more2_jax.matching.assignment import LogOdds
+from more2_jax.matching.assignment import LogOdds, assign
 from more2_jax.matching.candidates import AlignedPairs
 from more2_jax.tracking import identify
-from more2_jax.tracking.identify import LEFT_OVER, Found, Identified, with_left_over
+from more2_jax.tracking.identify import LEFT_OVER, Found, Identified, with_left_over, without_standing
 from more2_jax.types import Frame
 
 FREE, UPRIGHT = preset("robust", upright=False), preset("robust", upright=True)
@@ -26,14 +27,20 @@ KNOWN = Identified(
 )
 
 
+def losses(pairs: np.ndarray, standing: Collection[tuple[int, int]]) -> np.ndarray:
+    """3 of each pair whose object still stands where it stood."""
+    return np.array([3.0 * (tuple(pair) in standing) for pair in pairs.tolist()])
+
+
 def told(
-    monkeypatch: pytest.MonkeyPatch, matrix: list[list[float]], config=FREE, known=KNOWN, here=()
+    monkeypatch: pytest.MonkeyPatch, matrix: list[list[float]], config=FREE, known=KNOWN, here=(), standing=()
 ) -> Identified:
     odds = LogOdds.of(np.array(matrix, float))
     lie_there = np.array([tuple(pair) in here for pair in odds.pairs.tolist()])
     monkeypatch.setattr(identify, "odds_of", lambda *_: odds)
     monkeypatch.setattr(identify, "in_place", lambda _, rows, __: rows & lie_there)
     monkeypatch.setattr(identify, "motion_odds", lambda *_: np.zeros(9))
+    monkeypatch.setattr(identify, "lost_by_standing", lambda _, moved, *__: losses(moved, standing))
     return with_left_over(known, config)
 
 
@@ -85,3 +92,35 @@ def test_what_was_found_is_not_taken_from_what_lies_in_its_place(monkeypatch, co
 def test_where_nothing_tells_how_a_scan_lies_places_say_nothing(monkeypatch):
     lost = dataclasses.replace(KNOWN, frame=Frame(unknown=True))
     assert told(monkeypatch, [[-9, 3, -9]] * 3, UPRIGHT, lost, here={(1, 2)}) is lost
+
+
+def test_what_still_stands_is_not_what_is_left_over_elsewhere(monkeypatch):
+    near_even = [[-4, 3, -4], [-0.1, -4, -0.3], [-4, -4, -4]]
+    found = told(monkeypatch, near_even, standing={(1, 0)})
+    assert pairs(found) == [(0, 1), (1, 2)]  # the next best is as likely as ever
+    assert found.lost == {(1, 0): 3.0}
+    assert told(monkeypatch, near_even, standing={(1, 0), (1, 2)}) is KNOWN
+
+
+def test_an_assignment_is_made_anew_until_nothing_in_it_still_stands():
+    odds = LogOdds.of(np.array([[2.0, 1.5], [1.0, 0.8]]))
+    asked = []
+
+    def standing(moved: np.ndarray) -> np.ndarray:
+        asked.extend(map(tuple, moved.tolist()))
+        return losses(moved, {(0, 0), (0, 1)})
+
+    found, lost = without_standing(lambda lost: assign(odds.less(lost)), standing)
+    assert found.tolist() == [[1, 0]]
+    assert lost == {(0, 0): 3.0, (0, 1): 3.0}
+    assert len(asked) == len(set(asked))  # of none twice
+    again, _ = without_standing(
+        lambda lost: assign(odds.less(lost)), lambda moved: np.zeros(len(moved)), lost
+    )
+    assert again.tolist() == found.tolist()  # what was lost stays lost
+
+
+def test_what_is_very_likely_moved_though_something_alike_stands_there():
+    odds = LogOdds.of(np.array([[5.0]]))
+    found, _ = without_standing(lambda lost: assign(odds.less(lost)), lambda moved: np.full(len(moved), 3.0))
+    assert found.tolist() == [[0, 0]]
