@@ -118,14 +118,15 @@ def shares_still_there(
     of the cloud, background aside, that does not count.
     """
     background = NearPoints(next(clouds))
-    boxes = [(p.min(axis=0) - near_m, p.max(axis=0) + near_m) for p in places]
+    first, last = (np.array([f(p, axis=0) for p in places]).reshape(-1, 3) for f in (np.min, np.max))
+    first, last = first - near_m, last + near_m
+    own = np.full(len(places), -1) if but is None else np.asarray(but)
     beside: list[list[Points]] = [[np.zeros((0, 3))] for _ in places]
-    but = [-1] * len(places) if but is None else but
     for n, cloud in ((n, c) for n, c in enumerate(clouds) if len(c)):
         low, high = cloud.min(axis=0), cloud.max(axis=0)
-        for (first, last), parts, own in zip(boxes, beside, but, strict=True):
-            if n != own and (low <= last).all() and (first <= high).all():
-                parts.append(cloud[((cloud >= first) & (cloud <= last)).all(axis=1)])
+        for at in np.flatnonzero((own != n) & ((low <= last) & (first <= high)).all(axis=1)).tolist():
+            inside = (cloud >= first[at]) & (cloud <= last[at])
+            beside[at].append(cloud[inside.all(axis=1)])
     shares = list[float]()
     for place, parts in zip(places, beside, strict=True):
         surfaces = around(place, background, np.concatenate(parts), background)

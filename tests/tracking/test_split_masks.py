@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from more2_jax.geometry.poses import apply_pose
 from more2_jax.tracking.objects import new_object, next_number, points_of
 from more2_jax.tracking.split_masks import joined, mend_splits, share_on
-from more2_jax.types import Color, Embedding, Instance, Observation, Repair, ScanRecord
+from more2_jax.types import Color, Embedding, Frame, Instance, Observation, Repair, ScanRecord
 
 RNG = np.random.default_rng(0)
 CODE = Embedding(
@@ -81,6 +81,18 @@ def test_another_object_beside_it_does_not():
 @pytest.mark.parametrize("changes", [{"converged": False}, {"misfit": 0.8}])
 def test_a_pose_in_doubt_joins_nothing(changes):
     assert not now_in_two(**changes).repairs
+
+
+@pytest.mark.parametrize("changes", [{"converged": False}, {"misfit": 0.8}])
+def test_what_stayed_needs_no_pose_that_fits(changes):
+    """A part fits the whole badly both ways; that it lies on the whole where nothing moved is enough."""
+    frame = Frame(T_scene_scan=np.linalg.inv(MOVED))
+    (repair,) = now_in_two(frame=frame, **changes).repairs
+    assert repair.instances == (1, 2)
+    off = Frame(T_scene_scan=pose(0, [0.0, 0.0, 0.4]) @ frame.T_scene_scan)
+    assert not now_in_two(frame=off, **changes).repairs
+    lost = dataclasses.replace(frame, unknown=True)
+    assert not now_in_two(frame=lost, **changes).repairs
 
 
 def test_the_pose_decides_not_the_likeness():

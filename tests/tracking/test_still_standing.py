@@ -1,0 +1,137 @@
+"""What still stands where it stood speaks against its having moved, and nothing else does."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from more2_jax.geometry.poses import apply_pose
+from more2_jax.matching.candidates import AlignedPairs
+from more2_jax.tracking.rooms import Rooms
+from more2_jax.tracking.still_standing import STANDS, lost_by_standing
+from more2_jax.types import Frame
+
+FLOOR = np.random.default_rng(0).uniform([-1, -1, 0], [6, 6, 0], (20_000, 3))
+PAIR = np.array([[0, 0]])
+
+
+def box(seed, corner, size=(0.8, 0.6, 0.7), count=3000):
+    """The surface of a box."""
+    rng = np.random.default_rng(seed)
+    points = rng.uniform(size=(count, 3))
+    points[np.arange(count), rng.integers(0, 3, count)] = rng.integers(0, 2, count)
+    return points * size + corner
+
+
+HERE, THERE = [1.0, 1.0, 0.0], [4.0, 3.5, 0.0]
+FREE = [4.0, 0.0, 0.0]
+
+
+class PairsAlone(AlignedPairs):
+    """Clouds and poses of pairs, with nothing prepared."""
+
+    sides = ([], [])
+
+
+def lost(old, new, scene=FLOOR, scan=FLOOR, frame=None, pairs=PAIR, said_to_stay=False):
+    """What pairs lose; clouds of the first scan, and of the second, all in the scene's frame."""
+    frame = frame or Frame(T_scene_scan=np.eye(4))
+    back = np.linalg.inv(frame.T_scene_scan)
+    sides = tuple(
+        [SimpleNamespace(points=p) for p in clouds] for clouds in ([apply_pose(back, c) for c in new], old)
+    )
+    T = np.broadcast_to(np.eye(4), (len(pairs), 1, 4, 4)).copy()
+    T[:, 0] = frame.T_scene_scan
+    if not said_to_stay:
+        T[:, 0, :3, 3] += 10.0
+    aligned = object.__new__(PairsAlone)
+    compared = SimpleNamespace(color=np.zeros(len(pairs)))
+    for name, value in (
+        ("rows", np.asarray(pairs)),
+        ("sides", sides),
+        ("T_old_new", T),
+        ("compared", compared),
+    ):
+        object.__setattr__(aligned, name, value)
+    rooms = Rooms(scene=scene, scan=apply_pose(back, scan))
+    return lost_by_standing(aligned, np.asarray(pairs), frame, rooms).tolist()
+
+
+def test_what_left_an_empty_place_for_another_empty_one_loses_nothing():
+    assert lost([box(0, HERE)], [box(1, THERE)]) == [0.0]
+
+
+@pytest.mark.parametrize("masked", [True, False])
+def test_an_object_whose_surface_still_stands_there_did_not_move(masked):
+    still = box(2, HERE)
+    elsewhere = [box(1, THERE), *([still] if masked else [])]
+    scan = FLOOR if masked else np.concatenate([FLOOR, still])
+    assert lost([box(0, HERE)], elsewhere, scan=scan) == [STANDS]
+
+
+@pytest.mark.parametrize("masked", [True, False])
+def test_an_instance_that_stood_there_before_did_not_come(masked):
+    before = box(2, THERE)
+    known = [box(0, HERE), *([before] if masked else [])]
+    scene = FLOOR if masked else np.concatenate([FLOOR, before])
+    assert lost(known, [box(1, THERE)], scene=scene) == [STANDS]
+
+
+def test_both_speak_twice():
+    both = [box(3, HERE), box(4, THERE)]
+    assert lost([box(0, HERE), both[1]], [box(1, THERE), both[0]]) == [2 * STANDS]
+
+
+def test_its_own_points_are_no_evidence_against_it():
+    """Slid by less than its length, it lies on its old place in part; what stayed is another pair's matter."""
+    slid = box(1, np.add(HERE, [0.3, 0.0, 0.0]))
+    assert lost([box(0, HERE)], [slid]) == [0.0]
+    assert lost([box(0, HERE)], [box(1, HERE), box(2, HERE)]) == [0.0]
+    assert lost([box(0, HERE)], [box(1, THERE), box(2, HERE)], said_to_stay=True) == [0.0]
+
+
+def test_parts_of_one_thing_beside_one_another_have_not_changed_places():
+    """Either half of a divided mask may be said to be either half of the object: neither went anywhere."""
+    halves = [HERE, np.add(HERE, [0.5, 0.0, 0.3])]
+    old, new = ([box(3 * way + k, corner) for k, corner in enumerate(halves)] for way in (0, 1))
+    assert lost(old, new, pairs=np.array([[0, 1], [1, 0]])) == [0.0, 0.0]
+
+
+@pytest.mark.parametrize(("share", "told"), [(0.5, 0.0), (1.0, STANDS)])
+def test_half_of_it_may_lie_on_what_was_put_there_since(share, told):
+    object_ = box(0, HERE)
+    there = object_[object_[:, 0] <= HERE[0] + 0.8 * share]
+    assert lost([object_], [box(1, THERE), there]) == [told]
+
+
+def test_another_thing_put_there_is_not_the_object():
+    smaller = box(2, HERE, size=(0.4, 0.3, 0.4))
+    assert lost([box(0, HERE)], [box(1, THERE), smaller]) == [0.0]
+
+
+def test_floor_and_a_wall_close_by_are_no_surface_of_it():
+    wall = np.random.default_rng(5).uniform([-1, 1.62, 0], [6, 1.62, 2.5], (15_000, 3))
+    around = np.concatenate([FLOOR, wall])
+    assert lost([box(0, HERE)], [box(1, THERE)], around, around) == [0.0]
+
+
+def test_it_is_the_scans_place_in_the_scene_that_counts_and_none_if_unknown():
+    c, s = np.cos(0.7), np.sin(0.7)
+    T = np.array([[c, -s, 0, 2.0], [s, c, 0, -1.0], [0, 0, 1, 0.1], [0, 0, 0, 1]])
+    clouds = [box(0, HERE)], [box(1, THERE), box(2, HERE)]
+    assert lost(*clouds, frame=Frame(T_scene_scan=T)) == [STANDS]
+    assert lost(*clouds, frame=Frame(T_scene_scan=T, unknown=True)) == [0.0]
+
+
+def test_scans_of_objects_alone_are_asked_as_well():
+    nothing = np.zeros((0, 3))
+    assert lost([box(0, HERE)], [box(1, THERE), box(2, HERE)], nothing, nothing) == [STANDS]
+    assert lost([box(0, HERE)], [box(1, THERE)], nothing, nothing) == [0.0]
+
+
+def test_every_pair_is_told_as_if_it_were_alone():
+    old = [box(0, HERE), box(1, FREE)]
+    new = [box(2, THERE), box(3, HERE)]
+    pairs = np.array([[0, 0], [1, 1]])
+    assert lost(old, new, pairs=pairs) == [STANDS, STANDS]  # the second stood where the first was
+    assert [lost(old, new, pairs=pairs[k : k + 1]) for k in (0, 1)] == [[STANDS], [STANDS]]
