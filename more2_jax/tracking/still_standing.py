@@ -33,17 +33,20 @@ def lost_by_standing(
 ) -> Float[np.ndarray, " q"]:
     """Log odds that pairs (object, instance) lose whose object still stands there, or whose instance stood there.
 
-    Only those that went elsewhere: beside one another may lie parts of one thing. None of a scan of unknown frame.
+    Only those that went elsewhere, as beside one another may lie parts of one thing, and that colors do not tell. None
+    of a scan of unknown frame.
     """
     lost = np.zeros(len(pairs))
     if frame.unknown or not len(pairs):
         return lost
-    here = dict(zip(map(tuple, aligned.rows.tolist()), stayed(aligned, frame.T_scene_scan), strict=True))
+    # Copies may have changed places: if colors say so, what stands there now is another one.
+    here = stayed(aligned, frame.T_scene_scan) | (aligned.compared.color > 0)
+    settled = dict(zip(map(tuple, aligned.rows.tolist()), here, strict=True))
     new, old = aligned.sides
     clouds = {
         n: (few(old[k].points), apply_pose(frame.T_scene_scan, few(new[i].points)))
         for n, (k, i) in enumerate(pairs.tolist())
-        if not here[k, i]
+        if not settled[k, i]
     }
     moved = [n for n, (a, b) in clouds.items() if apart(a, b)]
     if not moved:

@@ -33,7 +33,7 @@ class PairsAlone(AlignedPairs):
     sides = ([], [])
 
 
-def lost(old, new, scene=FLOOR, scan=FLOOR, frame=None, pairs=PAIR, said_to_stay=False):
+def lost(old, new, scene=FLOOR, scan=FLOOR, frame=None, pairs=PAIR, said_to_stay=False, color=0.0):
     """What pairs lose; clouds of the first scan, and of the second, all in the scene's frame."""
     frame = frame or Frame(T_scene_scan=np.eye(4))
     back = np.linalg.inv(frame.T_scene_scan)
@@ -45,7 +45,7 @@ def lost(old, new, scene=FLOOR, scan=FLOOR, frame=None, pairs=PAIR, said_to_stay
     if not said_to_stay:
         T[:, 0, :3, 3] += 10.0
     aligned = object.__new__(PairsAlone)
-    compared = SimpleNamespace(color=np.zeros(len(pairs)))
+    compared = SimpleNamespace(color=np.full(len(pairs), color))
     for name, value in (
         ("rows", np.asarray(pairs)),
         ("sides", sides),
@@ -102,6 +102,12 @@ def test_half_of_it_may_lie_on_what_was_put_there_since(share, told):
     object_ = box(0, HERE)
     there = object_[object_[:, 0] <= HERE[0] + 0.8 * share]
     assert lost([object_], [box(1, THERE), there]) == [told]
+
+
+@pytest.mark.parametrize(("color", "told"), [(2.0, 0.0), (-2.0, 2 * STANDS)])
+def test_copies_of_two_colors_may_have_changed_places(color, told):
+    both = [box(3, HERE), box(4, THERE)]
+    assert lost([box(0, HERE), both[1]], [box(1, THERE), both[0]], color=color) == [told]
 
 
 def test_another_thing_put_there_is_not_the_object():
