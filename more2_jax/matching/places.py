@@ -154,9 +154,9 @@ def on_each_other(
     return found
 
 
-def few(points: Points) -> Points:
-    """`FEW_POINTS` of them or somewhat more, at even steps."""
-    return points[:: max(1, len(points) // FEW_POINTS)]
+def few(points: Points, count: int = FEW_POINTS) -> Points:
+    """So many of them or somewhat more, at even steps."""
+    return points[:: max(1, len(points) // count)]
 
 
 def together(a: AlignedPairs, b: AlignedPairs) -> AlignedPairs:

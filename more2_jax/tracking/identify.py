@@ -50,7 +50,7 @@ class Identified:
     frame: Frame = SCENE_FRAME  # of the scan
     # The pairs that surfaces were compared of, for registration to go on with,
     aligned: AlignedPairs | None = None
-    # and what (object, instance) lost of log odds, as both still stand where they stood.
+    # and what they lost of log odds where places say that they did not move (`still_standing`).
     lost: Lost = field(default_factory=dict)
 
     def without_seen(self) -> Identified:
@@ -112,9 +112,10 @@ def without_standing(
     standing: Callable[[Chosen], Float[np.ndarray, " q"]],
     lost: Lost = NOTHING_LOST,
 ) -> tuple[Chosen, Lost]:
-    """An assignment in which what still stands where it stood has lost what speaks against its having moved.
+    """The likeliest assignment once its pairs have lost what their places say against them, and what they lost.
 
-    `chosen`: the assignment when some pairs have lost log odds. `standing`: what those that it holds are to lose.
+    `chosen`: the assignment when some pairs have lost log odds. `standing`: what given pairs lose. Only pairs that an
+    assignment holds are asked, each once. `lost`: what is known of that.
     """
     asked, found = dict(lost), chosen(lost)
     while new := [pair for pair in map(tuple, found.tolist()) if pair not in asked]:

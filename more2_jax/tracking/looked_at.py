@@ -8,7 +8,7 @@ every mask to be there.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 
 import numpy as np
@@ -110,23 +110,27 @@ def cannot_tell(
 
 
 def shares_still_there(
-    places: Sequence[Points], clouds: Iterator[Points], near_m: float, but: Sequence[int] | None = None
+    places: Sequence[Points],
+    clouds: Iterator[Points],
+    near_m: float,
+    but: Sequence[Collection[int]] | None = None,
 ) -> list[float]:
     """Shares of places that lie on surfaces of a scan other than floor and walls; the first cloud is its background.
 
-    Of the other clouds, one after the other, only what lies about the places is held. `but`: of each place, the number
-    of the cloud, background aside, that does not count.
+    Of the other clouds, one after the other, only what lies about the places is held. `but`: of each place, the numbers
+    of the clouds, background aside, that do not count.
     """
     background = NearPoints(next(clouds))
     first, last = (np.array([f(p, axis=0) for p in places]).reshape(-1, 3) for f in (np.min, np.max))
     first, last = first - near_m, last + near_m
-    own = np.full(len(places), -1) if but is None else np.asarray(but)
+    but = [()] * len(places) if but is None else but
     beside: list[list[Points]] = [[np.zeros((0, 3))] for _ in places]
     for n, cloud in ((n, c) for n, c in enumerate(clouds) if len(c)):
         low, high = cloud.min(axis=0), cloud.max(axis=0)
-        for at in np.flatnonzero((own != n) & ((low <= last) & (first <= high)).all(axis=1)).tolist():
-            inside = (cloud >= first[at]) & (cloud <= last[at])
-            beside[at].append(cloud[inside.all(axis=1)])
+        for at in np.flatnonzero(((low <= last) & (first <= high)).all(axis=1)).tolist():
+            if n not in but[at]:
+                inside = (cloud >= first[at]) & (cloud <= last[at])
+                beside[at].append(cloud[inside.all(axis=1)])
     shares = list[float]()
     for place, parts in zip(places, beside, strict=True):
         surfaces = around(place, background, np.concatenate(parts), background)

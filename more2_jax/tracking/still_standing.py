@@ -6,26 +6,25 @@ Where something moved to, nothing stood before.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections import defaultdict
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 from jaxtyping import Float
 
-from more2_jax.geometry.poses import Points, apply_pose
+from more2_jax.geometry.poses import Points, Pose, apply_pose
 from more2_jax.matching.assignment import Chosen
 from more2_jax.matching.candidates import AlignedPairs
-from more2_jax.matching.places import stayed
+from more2_jax.matching.places import OTHER_COLOR, few, stayed
 from more2_jax.tracking.looked_at import NEAR_M, shares_still_there, spacing_of
 from more2_jax.tracking.rooms import LEAST_BACKGROUND, Rooms
 from more2_jax.types import Frame
 
-# Chosen on rooms of regime `real` and `sparse`, docs/developing/notebook/still_standing.md.
+# Chosen on rooms of regime `real` and `sparse`, and two real captures: docs/developing/notebook/still_standing.md.
 STANDS = 3.5  # log odds that a pair loses for each of the two that still stands where the other scan has it
-LEAST_STANDING = (
-    0.75  # share of its points that lie on the other scan: half may lie on what was put there since
-)
+# Share of a cloud's points that lie on the other scan: half may lie on what was put there since.
+LEAST_STANDING = 0.75
 POINTS = 1000  # of a cloud, or somewhat more, that tell whether it stands there
-NOTHING = np.zeros((0, 3))
 
 
 def lost_by_standing(
@@ -33,47 +32,50 @@ def lost_by_standing(
 ) -> Float[np.ndarray, " q"]:
     """Log odds that pairs (object, instance) lose whose object still stands there, or whose instance stood there.
 
-    Only those that went elsewhere, as beside one another may lie parts of one thing, and that colors do not tell. None
-    of a scan of unknown frame.
+    Only those that went elsewhere: beside one another may lie parts of one thing. None of a scan of unknown frame.
     """
-    lost = np.zeros(len(pairs))
+    lost, T = np.zeros(len(pairs)), frame.T_scene_scan
     if frame.unknown or not len(pairs):
         return lost
-    # Copies may have changed places: if colors say so, what stands there now is another one.
-    here = stayed(aligned, frame.T_scene_scan) | (aligned.compared.color > 0)
-    settled = dict(zip(map(tuple, aligned.rows.tolist()), here, strict=True))
     new, old = aligned.sides
+    stays = dict(zip(map(tuple, aligned.rows.tolist()), stayed(aligned, T), strict=True))
     clouds = {
-        n: (few(old[k].points), apply_pose(frame.T_scene_scan, few(new[i].points)))
+        n: (few(old[k].points, POINTS), apply_pose(T, few(new[i].points, POINTS)))
         for n, (k, i) in enumerate(pairs.tolist())
-        if not settled[k, i]
+        if not stays[k, i]
     }
     moved = [n for n, (a, b) in clouds.items() if apart(a, b)]
     if not moved:
         return lost
-
-    def shown(side: int) -> Iterator[Points]:
-        """What a scan shows, in the scene's frame, its background first."""
-        background, objects = (rooms.scan, new) if side else (rooms.scene, old)
-        T = frame.T_scene_scan if side else np.eye(4)
-        yield apply_pose(T, background) if len(background) >= LEAST_BACKGROUND else NOTHING
-        yield from (apply_pose(T, o.points) for o in objects)
-
     remembered = spacing_of(rooms.scene) if len(rooms.scene) >= LEAST_BACKGROUND else 0.0
     # An object is looked for in the new scan, an instance in what was known before.
-    for side, near_m in enumerate((NEAR_M, max(NEAR_M, remembered))):
-        places, but = [clouds[n][side] for n in moved], pairs[moved, 1 - side].tolist()
-        shares = shares_still_there(places, shown(1 - side), near_m, but)
+    scan = shown(rooms.scan, (o.points for o in new), T)
+    before = shown(rooms.scene, (o.points for o in old), np.eye(4))
+    for side, (clouds_there, near_m) in enumerate(((scan, NEAR_M), (before, max(NEAR_M, remembered)))):
+        other_color = of_other_color(aligned, side)
+        but = [
+            {other, *other_color[own]} for own, other in (pairs[n, [side, 1 - side]].tolist() for n in moved)
+        ]
+        shares = shares_still_there([clouds[n][side] for n in moved], clouds_there, near_m, but)
         lost[moved] += STANDS * (np.array(shares) >= LEAST_STANDING)
     return lost
+
+
+def shown(background: Points, objects: Iterable[Points], T_scene: Pose) -> Iterator[Points]:
+    """What a scan shows, in the scene's frame, its background first: none where there is too little."""
+    yield apply_pose(T_scene, background if len(background) >= LEAST_BACKGROUND else background[:0])
+    yield from (apply_pose(T_scene, points) for points in objects)
+
+
+def of_other_color(aligned: AlignedPairs, side: int) -> dict[int, set[int]]:
+    """By object (side 0) or instance (1), those of the other scan that are another thing, be they alike in shape."""
+    found = defaultdict[int, set[int]](set)
+    for pair in aligned.rows[aligned.compared.color <= OTHER_COLOR].tolist():
+        found[pair[side]].add(pair[1 - side])
+    return found
 
 
 def apart(a: Points, b: Points) -> bool:
     """Whether the boxes of two clouds do not meet."""
     low, high = np.maximum(a.min(axis=0), b.min(axis=0)), np.minimum(a.max(axis=0), b.max(axis=0))
     return bool((low > high).any())
-
-
-def few(points: Points) -> Points:
-    """`POINTS` of them or somewhat more, at even steps."""
-    return points[:: max(1, len(points) // POINTS)]

@@ -33,21 +33,27 @@ class PairsAlone(AlignedPairs):
     sides = ([], [])
 
 
-def lost(old, new, scene=FLOOR, scan=FLOOR, frame=None, pairs=PAIR, said_to_stay=False, color=0.0):
-    """What pairs lose; clouds of the first scan, and of the second, all in the scene's frame."""
+def lost(
+    old, new, scene=FLOOR, scan=FLOOR, frame=None, pairs=PAIR, listed=None, said_to_stay=False, color=0.0
+):
+    """What pairs lose; clouds of the first scan, and of the second, all in the scene's frame.
+
+    `listed`: pairs that were compared, by default the same; `color`: log likelihood ratios of theirs.
+    """
+    listed = pairs if listed is None else listed
     frame = frame or Frame(T_scene_scan=np.eye(4))
     back = np.linalg.inv(frame.T_scene_scan)
     sides = tuple(
         [SimpleNamespace(points=p) for p in clouds] for clouds in ([apply_pose(back, c) for c in new], old)
     )
-    T = np.broadcast_to(np.eye(4), (len(pairs), 1, 4, 4)).copy()
+    T = np.broadcast_to(np.eye(4), (len(listed), 1, 4, 4)).copy()
     T[:, 0] = frame.T_scene_scan
     if not said_to_stay:
         T[:, 0, :3, 3] += 10.0
     aligned = object.__new__(PairsAlone)
-    compared = SimpleNamespace(color=np.full(len(pairs), color))
+    compared = SimpleNamespace(color=np.broadcast_to(color, len(listed)))
     for name, value in (
-        ("rows", np.asarray(pairs)),
+        ("rows", np.asarray(listed)),
         ("sides", sides),
         ("T_old_new", T),
         ("compared", compared),
@@ -104,10 +110,13 @@ def test_half_of_it_may_lie_on_what_was_put_there_since(share, told):
     assert lost([object_], [box(1, THERE), there]) == [told]
 
 
-@pytest.mark.parametrize(("color", "told"), [(2.0, 0.0), (-2.0, 2 * STANDS)])
+@pytest.mark.parametrize(("color", "told"), [(-2.0, 0.0), (2.0, 2 * STANDS)])
 def test_copies_of_two_colors_may_have_changed_places(color, told):
+    """Each stands where the other stood; only what has the color of what left is that."""
     both = [box(3, HERE), box(4, THERE)]
-    assert lost([box(0, HERE), both[1]], [box(1, THERE), both[0]], color=color) == [told]
+    listed = np.array([[0, 0], [0, 1], [1, 0], [1, 1]])
+    colors = [2.0, color, color, 2.0]
+    assert lost([box(0, HERE), both[1]], [box(1, THERE), both[0]], listed=listed, color=colors) == [told]
 
 
 def test_another_thing_put_there_is_not_the_object():
