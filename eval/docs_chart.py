@@ -54,7 +54,8 @@ def bars_of(figures: Path) -> Bars | None:
 
 def pair_of(kept: dict[str, Any], figure: str) -> tuple[float, float]:
     """Ours, and the best of the others, of one run."""
-    rows = [r for r in kept["rows"] if (r["name"], r["column"]) == (figure, "strict")]
+    every = [r for r in kept["rows"] if r.get("group", "all") == "all"]
+    rows = [r for r in every if (r["name"], r["column"]) == (figure, "strict")]
     ours, others = (
         [r["value"] for r in rows if r["method"].startswith(OURS) is mine] for mine in (True, False)
     )

@@ -7,8 +7,9 @@
     <!-- end of figures -->
 
 One run: a line a figure, with intervals, a column a method; with `; lines = methods` the other way round, for runs of
-many methods. Several: a line a run, ours / the best peer. With `; over = scans` a line a method of one run, and in
-every cell the figure after each number of scans.
+many methods. Several: a line a run, ours / the best peer. With `; by = collection` a line a collection of furniture of
+one run, in the same form. With `; over = scans` a line a method of one run, and in every cell the figure after each
+number of scans.
 """
 
 from __future__ import annotations
@@ -88,7 +89,8 @@ FIGURES = {
     "processor time": ("processor time a scene", ""),
     "processor time a pair": ("processor time a pair", ""),
 }
-SCANS = re.compile(r"scans \d+")  # groups that are kept beside all scenes
+SCANS = re.compile(r"scans \d+")  # groups that are kept in place of all scenes
+COLLECTION = re.compile(r"collection \w+")  # groups that are kept beside them
 SENSE = {"higher": 1.0, "lower": -1.0}
 # What programs count, where it is not pairs.
 COUNTED = {"reconstruction": "objects", "segmentation": "objects"}
@@ -120,10 +122,13 @@ def main(keep: Path | None = None, name: str = "", docs: Path = DOCS) -> None:
 
 
 def kept_of(results: dict[str, Any]) -> dict[str, Any]:
-    """Of results.json, the figures that pages may show, over all scenes or by scans, and what they belong to."""
+    """Of results.json, the figures that pages may show, over all scenes, by scans or collection, and their facts."""
     wanted = set(FIGURES.values())
     fields = ("name", "column", "method", "value", "unit", "better", "count", "failures", "ci95", "scenes")
-    groups = {r["group"] for r in results["rows"] if SCANS.fullmatch(r["group"])} or {"all"}
+    every = {r["group"] for r in results["rows"]}
+    groups = set(filter(SCANS.fullmatch, every)) or {"all"}
+    collections = set(filter(COLLECTION.fullmatch, every))
+    groups |= collections if len(collections) > 1 else set()
     rows = [
         {k: r[k] for k in fields} | ({} if r["group"] == "all" else {"group": r["group"]})
         for r in results["rows"]
@@ -158,6 +163,8 @@ def table_of(what: str, figures: Path) -> str:
         runs[name] = json.loads(path.read_text(encoding="utf-8"))
     if len(runs) > 1:
         lines = of_several(runs, shown)
+    elif "by" in asked:
+        lines = by_group(runs[names[0]], shown, asked["by"])
     elif "over" in asked:
         lines = over_groups(runs[names[0]], shown, asked["over"])
     elif asked.get("lines") == "methods":
@@ -260,10 +267,25 @@ def general(name: str, command: str) -> str:
     return re.sub(r"--data rooms/\w+", "--data rooms/ROOMS", command)
 
 
-def rows_of(kept: dict[str, Any], figure: str) -> dict[str, dict[str, Any]]:
-    """By method."""
+def by_group(kept: dict[str, Any], shown: Sequence[str], by: str) -> list[str]:
+    """A line a group of one run, such as `collection kenney`, a column a figure: ours / the best of the others."""
+    groups = sorted({g for r in kept["rows"] if (g := r.get("group", "")).startswith(f"{by} ")})
+    head = [by, *shown, "rooms, pairs"]
+    lines = [row_of(head), row_of(["---"] * len(head))]
+    for group in groups:
+        figures = [rows_of(kept, figure, group) for figure in shown]
+        first = next(iter(figures[0].values()))
+        counted = f"{first['scenes']}, {first['count']}"
+        lines.append(row_of([group.removeprefix(f"{by} "), *map(against_best, figures), counted]))
+    return [*lines, "", f"`{kept['command']}`, {kept['date'][:10]}."]
+
+
+def rows_of(kept: dict[str, Any], figure: str, group: str | None = None) -> dict[str, dict[str, Any]]:
+    """By method, over all scenes or of a group."""
     key = FIGURES[figure]
-    return {r["method"]: r for r in kept["rows"] if (r["name"], r["column"]) == key}
+    return {
+        r["method"]: r for r in kept["rows"] if (r["name"], r["column"]) == key and r.get("group") == group
+    }
 
 
 def against_best(rows: dict[str, dict[str, Any]]) -> str:

@@ -163,7 +163,7 @@ def records_of(
 PROGRAM = Program(
     settings=Settings,
     prepare=prepare,
-    summary=lambda o, right_deg: Summary(figures=figures(), groups=("to_scan", "category")),
+    summary=lambda o, right_deg: Summary(figures=figures(), groups=("to_scan", "category", "collection")),
 )
 
 if __name__ == "__main__":

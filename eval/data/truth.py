@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -11,6 +12,8 @@ import numpy as np
 from more2_jax.geometry.poses import Points, Pose
 from more2_jax.types import Instance, Mesh, Scan
 from train.furniture.symmetry import SymmetryGroup
+
+PACKED = re.compile(r"[^/]+/([a-z]+)_")  # category/collection_piece
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,6 +42,12 @@ class KnownObject:
         default_factory=dict
     )  # where it has no mask of its own: another's that holds it
     reshaped: frozenset[int] = frozenset()  # scans where its shape is not the one of `mesh`
+
+    @property
+    def collection(self) -> str:
+        """Where packed furniture comes from, as in "chair/kenney_chairDesk"; empty where names do not say it."""
+        named = PACKED.match(self.copies)
+        return named[1] if named else ""
 
     @property
     def first(self) -> int:

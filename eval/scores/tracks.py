@@ -110,6 +110,8 @@ def pair_record(
     scores = found_pose(scene, o, other, k, track) if not lost else failed_pose()
     rigid = o.same_shape(o.first, k)
     record: Record = {"object": o.name, "category": o.category, "to_scan": k, **(scores if rigid else {})}
+    if o.collection:
+        record["collection"] = o.collection
     for c in COLUMNS:
         if c == "published" and lost:
             continue

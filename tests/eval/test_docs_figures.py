@@ -93,6 +93,30 @@ def test_figures_over_scans_stand_in_one_cell():
     assert lines[-1].endswith("2 rooms, 8 objects.")
 
 
+def test_collections_of_furniture_are_told_apart_beside_the_whole(tmp_path):
+    rows = [
+        row("MR", "strict", m, v, group=g)
+        for m, values in (("ours, robust", (60.0, 50.0, 70.0)), ("GICP", (55.0, 52.0, 58.0)))
+        for g, v in zip(("all", "collection kenney", "collection clvrai"), values, strict=True)
+    ]
+    main(run_of(tmp_path, rows), "a", tmp_path)
+    page = "<!-- figures: runs = a; show = MR; by = collection -->\n<!-- end of figures -->"
+    lines = with_tables(page, tmp_path / "figures").splitlines()
+    assert lines[1] == "| collection | MR | rooms, pairs |"
+    assert lines[3:5] == ["| clvrai | **70.0** / 58.0 | 2, 8 |", "| kenney | 50.0 / **52.0** | 2, 8 |"]
+    whole = with_tables(page.replace("; by = collection", ""), tmp_path / "figures")
+    assert "**60.0**" in whole and "70.0" not in whole
+    alone = kept_of(RESULTS | {"rows": rows[:2]})["rows"]
+    assert [r["value"] for r in alone] == [60.0]
+
+
+def run_of(folder, rows):
+    run = folder / "run"
+    run.mkdir()
+    (run / "results.json").write_text(json.dumps(RESULTS | {"rows": rows}), encoding="utf-8")
+    return run
+
+
 def test_a_single_method_has_no_best_and_a_table_says_what_it_counts(docs):
     results = RESULTS | {
         "command": "python -m eval.segmentation --data rooms",

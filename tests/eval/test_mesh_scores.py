@@ -246,6 +246,14 @@ def test_each_stage_alone_can_fail():
     assert (totals(found, "mr.strict"), totals(found, "mrr.strict")) == ((8, 8), (6, 8))
 
 
+def test_pairs_know_the_collection_that_their_furniture_is_of():
+    named = ("chair/kenney_chairDesk", "small-table/clvrai_table_lack_0825", "Bench_applaro", "box")
+    owners = [dataclasses.replace(o, copies=c) for o, c in zip(SCENE.objects, named, strict=True)]
+    records = score_tracks(dataclasses.replace(SCENE, objects=tuple(owners)), [], 5.0, 10)
+    expected = {o.name: c for o, c in zip(owners, ("kenney", "clvrai", None, None), strict=True)}
+    assert {r["object"]: r.get("collection") for r in records} == expected
+
+
 def test_what_is_said_of_motion_counts_for_scans_that_follow_each_other():
     tracks = [true_track(o) for o in SCENE.objects]
     known = [dict.fromkeys((1, 2), k % 2 == 0) for k in range(len(tracks))]
