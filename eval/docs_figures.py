@@ -36,6 +36,8 @@ FIGURES = {
     "F1": ("added and removed, F1", ""),
     "told as changed without a mask": ("told as changed without a mask", ""),
     "told whether it moved": ("told whether it moved", "strict"),
+    "calibration error of matches": ("calibration error of matches", ""),
+    "calibration error of changes": ("calibration error of changes", ""),
     "t-mAP": ("t-mAP", ""),
     "t-AP50": ("t-AP50", ""),
     "median RE": ("MedRE of true pairs", "strict"),

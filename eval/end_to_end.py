@@ -11,6 +11,7 @@ import itertools
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Annotated, Any
 
 import jax
@@ -27,8 +28,9 @@ from eval.performance.stopwatch import clock, told
 from eval.scores.figures import Figure, Record, in_columns
 from eval.scores.mended_masks import with_added_masks, with_divided_masks
 from eval.scores.temporal_ap import temporal_records
+from eval.scores.told_chances import CHANGES, MATCHES, told_chances
 from eval.scores.tracks import Track, changes_f1, false_changes, score_tracks, tracks_of
-from more2_jax.config import SceneConfig
+from more2_jax.config import EvidenceMatcher, SceneConfig
 from more2_jax.network.prior import Prior
 from more2_jax.network.shared_calls import side_by_side
 from more2_jax.scene import add_scan, reconstruct, start_scene
@@ -64,6 +66,8 @@ def figures() -> list[Figure]:
         replace(share, name="told whether it moved", key="told.strict", column="strict"),
         replace(share, name="added and removed, F1", key="changes_f1", statistic="mean"),
         replace(share, name="told as changed without a mask", key="false_change", better="lower"),
+        MATCHES,
+        CHANGES,
         *(replace(share, name=n, key=k, statistic="average_precision") for n, k in TEMPORAL.items()),
         time,
         replace(time, name="processor time a scene", key="cpu_seconds"),
@@ -88,7 +92,7 @@ def prepare(options: Settings) -> tuple[Run, Work]:
     current = open_run("end_to_end", options, {**facts, **stated(options.learned)})
     methods: dict[str, Callable[[KnownScene], list[Track]]] = {}
     for name, config in ours.items():
-        methods[name] = lambda s, c=config: tracks_of(living_scene(s, current.prior, c))
+        methods[name] = partial(found_tracks, prior=current.prior, config=config)
     for name, stages in peers.items():
         methods[name] = lambda s, p=stages: combined(s.scans, p)
 
@@ -105,6 +109,13 @@ def prepare(options: Settings) -> tuple[Run, Work]:
         return on_all_devices(one, scenes, options.at_once)
 
     return current, work
+
+
+def found_tracks(scene: KnownScene, prior: Prior, config: SceneConfig) -> list[Track]:
+    """What the method says of a scene."""
+    return tracks_of(
+        living_scene(scene, prior, config), probable=isinstance(config.matching, EvidenceMatcher)
+    )
 
 
 def on_all_devices(
@@ -154,10 +165,11 @@ def records_of(
     scene, tracks = with_divided_masks(scene, tracks)
     false: list[Record] = [{"false_change": x} for x in false_changes(scene, tracks)]
     scene, tracks = with_added_masks(scene, tracks)
+    chances = told_chances(scene, tracks)
     pairs = score_tracks(scene, tracks, right_deg, samples, says_motion=name.startswith(OURS))
     whole: Record = {**taken, "changes_f1": changes_f1(scene, tracks), "reason": reason}
     whole |= followed
-    return [{"method": name, **r} for r in [*pairs, *false, whole]]
+    return [{"method": name, **r} for r in [*pairs, *false, *chances, whole]]
 
 
 PROGRAM = Program(

@@ -9,8 +9,10 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float
 from scipy import stats
+from scipy.special import logit
 
 from eval.scores.average_precision import ap_of_rows
+from eval.scores.reliability import calibration_error
 
 Record = dict[str, Any]  # one pair, object or scan pair; None stands for a failure
 Column = Literal["paper", "published", "strict", ""]
@@ -28,11 +30,12 @@ class Figure:
     `mean`: of the records that have a value. `median`: of all; a failure is worse than any value.
     `ratio`: the sum of `key` over the sum of `over`.
     `average_precision`: of the predictions of all scenes together; `key` holds the `ap_rows` of one.
+    `calibration`: the expected calibration error of probabilities (`key`) of what is so or not (`over`: 1 or 0).
     """
 
     name: str
     key: str
-    statistic: Literal["share", "at_least", "mean", "median", "ratio", "average_precision"]
+    statistic: Literal["share", "at_least", "mean", "median", "ratio", "average_precision", "calibration"]
     column: Column = ""
     unit: str = ""
     better: Literal["higher", "lower"] = "higher"
@@ -122,6 +125,8 @@ def reduce(figure: Figure, rows: np.ndarray) -> float:
     """The statistic of pooled rows; NaN of nothing."""
     if figure.statistic == "average_precision":
         return ap_of_rows(rows)
+    if figure.statistic == "calibration":
+        return calibration_error(logit(rows[:, 0]), rows[:, 1] > 0)
     if figure.statistic == "median":
         return _median(rows[:, 0], worst=np.inf if figure.better == "lower" else -np.inf)
     above, below = parts(figure, rows)
@@ -140,7 +145,7 @@ def interval(figure: Figure, arrays: Sequence[np.ndarray]) -> tuple[float, float
     if len(arrays) < 2:
         return None
     index = np.random.default_rng(0).integers(0, len(arrays), (DRAWS, len(arrays)))
-    if figure.statistic in ("median", "average_precision"):
+    if figure.statistic in ("median", "average_precision", "calibration"):
         draws = np.array([reduce(figure, np.concatenate([arrays[k] for k in row])) for row in index])
     else:
         above, below = np.array([parts(figure, a) for a in arrays]).T

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence, Set
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -33,32 +33,38 @@ class Track:
     )  # by scan, its own points, where masks were mended; else those of its instance
     moved: dict[int, bool] = field(default_factory=dict)  # by scan, since the one before; where that is said
     not_seen: frozenset[int] = frozenset()  # scans of which it is said that they did not look for it
+    # How probable it is said to be, by scan: that it is one object with the first, and
+    matched: dict[int, float] = field(default_factory=dict)
+    # that of this scan and the one before, one alone has it.
+    alone: dict[int, float] = field(default_factory=dict)
 
 
-def tracks_of(scene: LivingScene) -> list[Track]:
-    """The objects of a living scene."""
+def tracks_of(scene: LivingScene, *, probable: bool = False) -> list[Track]:
+    """The objects of a living scene. `probable`: scores of matches are probabilities (`EvidenceMatcher`)."""
     return [
         Track(
             instance={seen.scan: seen.instance for seen in o.observations},
             T_track_scan={seen.scan: seen.T_ref_scan for seen in o.observations},
             points=accumulated_points(o),
             mesh=o.mesh,
-            score=min(*(seen.score for seen in o.observations), *in_one_scan(scene, o.id), 1.0),
+            score=min(*(seen.score for seen in o.observations), *in_one_scan(scene, o.id).values(), 1.0),
             seen={seen.scan: points_of(o, seen) for seen in o.observations},
             moved={c.to_scan: o.id in c.moved for c in scene.changes if o.id in c.moved + c.static},
             not_seen=frozenset(s.index for s in scene.scans if o.id in s.not_seen),
+            matched={seen.scan: seen.score for seen in o.observations[1:] if probable},
+            alone=in_one_scan(scene, o.id) if probable else {},
         )
         for o in scene.objects
     ]
 
 
-def in_one_scan(scene: LivingScene, id_: str) -> list[float]:
-    """How probable it is that an object was in one scan alone, of every pair of scans where that is said of it."""
-    return [
-        c.probability[id_]
+def in_one_scan(scene: LivingScene, id_: str) -> dict[int, float]:
+    """How probable it is that an object was in one scan alone, by the later scan of every pair where that is said."""
+    return {
+        c.to_scan: c.probability[id_]
         for c in scene.changes
         if id_ in c.probability and id_ in c.added + c.removed + c.not_seen + c.discovered
-    ]
+    }
 
 
 def track_with(tracks: Sequence[Track], scan: int, instance: int) -> Track | None:
@@ -155,20 +161,40 @@ def changes_f1(scene: KnownScene, tracks: Sequence[Track]) -> float:
     did not look at the place (less than `LEAST_IN_SIGHT` of it). What is said of either counts neither way. A method
     that says it did not look for something does not say that it came or went.
     """
-    said, true, open_ = set[str](), set[str](), set[str]()
+    true, open_ = true_changes(scene)
+    return f1(set(said_changes(scene, tracks)) - open_, true)
+
+
+Change = tuple[str, int, int]  # added or removed, the later scan, the instance
+
+
+def said_changes(scene: KnownScene, tracks: Sequence[Track]) -> dict[Change, Track]:
+    """What is said to have come or gone between scans that follow each other, and the track that says so."""
+    return {
+        (name, k, t.instance[here]): t
+        for k in range(1, len(scene.scans))
+        for name, here, other in sides(k)
+        for t in tracks
+        if here in t.instance and other not in t.instance and other not in t.not_seen
+    }
+
+
+def true_changes(scene: KnownScene) -> tuple[set[Change], set[Change]]:
+    """What really came or went, and what counts neither way."""
+    true, open_ = set[Change](), set[Change]()
     for k in range(1, len(scene.scans)):
-        for name, here, other in (("added", k, k - 1), ("removed", k - 1, k)):
-            said |= {
-                f"{name} {k} {t.instance[here]}"
-                for t in tracks
-                if here in t.instance and other not in t.instance and other not in t.not_seen
-            }
+        for name, here, other in sides(k):
             for o in (o for o in scene.objects if here in o.instance and other not in o.instance):
                 if other in o.T_scan_model or scene.in_sight(o, other, here) < LEAST_IN_SIGHT:
-                    open_ |= {f"{name} {k} {i}" for i in o.masks(here)}
+                    open_ |= {(name, k, i) for i in o.masks(here)}
                 else:
-                    true.add(f"{name} {k} {o.instance[here]}")
-    return f1(said - open_, true)
+                    true.add((name, k, o.instance[here]))
+    return true, open_
+
+
+def sides(k: int) -> tuple[tuple[str, int, int], tuple[str, int, int]]:
+    """Of scan `k` and the one before: what a change is called, the scan that has the object, the one that lacks it."""
+    return ("added", k, k - 1), ("removed", k - 1, k)
 
 
 def false_changes(scene: KnownScene, tracks: Sequence[Track]) -> list[float]:
@@ -188,7 +214,7 @@ def false_changes(scene: KnownScene, tracks: Sequence[Track]) -> list[float]:
     return found
 
 
-def f1(predicted: set[str], truth: set[str]) -> float:
+def f1(predicted: Set[Hashable], truth: Set[Hashable]) -> float:
     """Harmonic mean of precision and recall of a set; 1 when both are empty."""
     if not predicted and not truth:
         return 1.0

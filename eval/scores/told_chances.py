@@ -1,0 +1,52 @@
+"""Whether the probabilities that a living scene tells hold: of its matches, and of what it says came or went."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from eval.data.truth import KnownScene
+from eval.scores.figures import Figure, Record
+from eval.scores.tracks import Track, said_changes, true_changes
+
+MATCHES, CHANGES = (
+    Figure(
+        name=f"calibration error of {kind}",
+        key=f"said.{kind}",
+        over=f"so.{kind}",
+        statistic="calibration",
+        unit="%",
+        scale=100,
+        better="lower",
+    )
+    for kind in ("matches", "changes")
+)
+
+
+def told_chances(scene: KnownScene, tracks: Sequence[Track]) -> list[Record]:
+    """Of every match and change that is told with a probability: what is said, and whether it is so (1 or 0)."""
+    return [*matches_told(scene, tracks), *changes_told(scene, tracks)]
+
+
+def matches_told(scene: KnownScene, tracks: Sequence[Track]) -> list[Record]:
+    """Right is what shows the object of the first scan, or a copy. Of two masks of no object nothing is known."""
+    found = list[Record]()
+    for t in tracks:
+        first = min(t.instance)
+        before = scene.owner(first, t.instance[first])
+        for k, said in t.matched.items():
+            after = scene.owner(k, t.instance[k])
+            if before is None and after is None:
+                continue
+            so = before is not None and after is not None and before.copies == after.copies
+            found.append({MATCHES.key: said, MATCHES.over: float(so)})
+    return found
+
+
+def changes_told(scene: KnownScene, tracks: Sequence[Track]) -> list[Record]:
+    """Right is what really came or went; what counts neither way is left out, as in `changes_f1`."""
+    true, open_ = true_changes(scene)
+    return [
+        {CHANGES.key: t.alone[change[1]], CHANGES.over: float(change in true)}
+        for change, t in said_changes(scene, tracks).items()
+        if change not in open_ and change[1] in t.alone
+    ]
