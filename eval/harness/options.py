@@ -10,6 +10,7 @@ import numpy as np
 
 from eval.data.flyingshape import flyingshape
 from eval.data.threerscan import threerscan
+from eval.data.tilted import tilted
 from eval.data.truth import Benchmark, KnownScene
 from more2_jax.config import (
     DescentRegistration,
@@ -49,6 +50,8 @@ class Options:
     whole scenes): it is told nothing, as `more2 run`, and peers as the data were made."""
     rooms: Literal["all", "first", "none"] = "all"
     """Which scans keep what is no object: floor, walls, clutter."""
+    tilt: float | None = None
+    """Degrees by which every scan is tilted against gravity, each another way; as the data were made without it."""
     sensors: bool = True
     """Whether the method is told where the sensors of every scan stood, where the data say so. Peers never ask."""
     peers: bool = True
@@ -123,13 +126,14 @@ def benchmark(o: Options) -> Benchmark:
         if o.dataset == "3rscan"
         else flyingshape(o.data)
     )
-    if o.sensors and o.rooms == "all":
+    if o.sensors and o.rooms == "all" and o.tilt is None:
         return data
     return replace(data, read=lambda name: less_told(data.read(name), o))
 
 
 def less_told(scene: KnownScene, o: Options) -> KnownScene:
-    """The scene without what the options withhold."""
+    """The scene without what the options withhold, and tilted if they say so."""
+    scene = scene if o.tilt is None else tilted(scene, o.tilt)
     scene = scene if o.sensors else without_sensors(scene)
     kept = {"all": len(scene.scans), "first": 1, "none": 0}[o.rooms]
     bare = [replace(s, background=np.zeros((0, 3))) for s in scene.scans[kept:]]

@@ -86,6 +86,7 @@ def open_run(program: str, o: Options, settings: dict[str, Any]) -> Run:
         "masks": o.masks,
         "rooms": o.rooms,
         "visits": o.visits,
+        **({} if o.tilt is None else {"tilt": o.tilt}),
         **settings,
     }
     return Run(
