@@ -198,7 +198,7 @@ def added(
     chance = chances(identified, objects, fresh, counted_alone(objects, missing, fresh, scene.scans), config)
     objects, frame = as_given([*mended.whole(objects), *fresh.values()], index, frame, T_level_scan)
     before = not_looked_at_before(objects, list(fresh.values()), scene.scans, scene.upright)
-    repairs = (*whole.repairs, *whole.masks(found, fresh), *mended.repairs)
+    repairs = (*whole.all_repairs(found, fresh), *mended.repairs)
     scene = forgotten(scene, {id_ for r in repairs for id_ in r.absorbed})
     repairs = (*repairs, *cleared.repairs(index, objects, repairs), *borders)
     earlier = with_not_seen(scene.scans, before, not_sought(whole, scene.scans))

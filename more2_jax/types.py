@@ -365,7 +365,7 @@ class Repair:
     regained: int = 0  # points beside a mask that are the object's
     unmasked: int = 0  # points of the object where no mask shows it, found as a new one of `instances`
     points: int = 0  # of the mask, before
-    share: float = 1.0  # of the part, that lies on the whole; of points dropped or regained: beyond doubt
+    share: float = 1.0  # how sure: of a part, what lies on the whole; of points, beyond doubt; else the match
     smooth: float = 0.0  # share of the border between parts, where no other scan shows the whole
 
 

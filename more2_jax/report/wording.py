@@ -125,11 +125,12 @@ def repair_text(scan: ScanRecord, repair: Repair) -> str:
     if repair.divided is not None:
         both = f"{repair.object} and {repair.divided}"
         if not repair.instances:
-            return f"{scan.name}: one mask of the scan before held {both}"
-        return f"{scan.name}: instance {repair.instances[0]} is {both} in one mask"
+            return f"{scan.name}: one mask of the scan before held {both} ({repair.share:.0%} sure)"
+        return f"{scan.name}: instance {repair.instances[0]} is {both} in one mask ({repair.share:.0%} sure)"
     if repair.unmasked:
         where = f"as instance {repair.instances[0]}" if repair.instances else "in the scan before"
-        return f"{scan.name}: {repair.unmasked} points without a mask are {repair.object}, {where}"
+        points = f"{repair.unmasked} points without a mask are {repair.object}, {where}"
+        return f"{scan.name}: {points} ({repair.share:.0%} sure)"
     if repair.dropped or repair.regained:
         return f"{scan.name}: {_border_text(repair)} ({repair.share:.0%} within half the tolerance)"
     sure = f"in parts ({repair.share:.0%} on it)"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from more2_jax.tracking.identify import Found
 from more2_jax.types import Embedding, Instance, Repair, SceneObject
@@ -58,6 +58,11 @@ class Regrouped:
             *(Repair(object=o.id, unmasked=len(o.points)) for o in self.unmasked_objects()),
         )
 
+    def all_repairs(self, found: Sequence[Found], fresh: Mapping[int, SceneObject]) -> tuple[Repair, ...]:
+        """Those of objects and of masks, each as sure as the least sure match that rests on it."""
+        chance = {self.objects[f.object].id: f.score for f in found}
+        return tuple(as_sure(r, chance) for r in (*self.repairs, *self.masks(found, fresh)))
+
     def masked(self, found: Sequence[Found]) -> list[Found]:
         """Those found of which a mask shows both the object and the instance."""
         return [f for f in found if not (self.is_unmasked(0, f.object) or self.is_unmasked(1, f.instance))]
@@ -69,3 +74,14 @@ class Regrouped:
     def unmasked_objects(self) -> list[SceneObject]:
         """The objects that no mask of the scan before shows."""
         return self.objects[len(self.objects) - self.unmasked[0] :]
+
+
+def as_sure(repair: Repair, chance: Mapping[str, float]) -> Repair:
+    """A mask that was divided or missing, with the least probability of a match of its objects. Others as they are.
+
+    `chance`: of the matches of the scan, by object id.
+    """
+    if repair.divided is None and not repair.unmasked:
+        return repair
+    resting = [chance[id_] for id_ in (repair.object, repair.divided) if id_ in chance]
+    return replace(repair, share=min(resting, default=repair.share))

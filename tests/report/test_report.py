@@ -367,12 +367,12 @@ def test_mended_masks_are_listed():
     repairs = (
         Repair(object="object_001", instances=(3, 5, 6), share=0.92),
         Repair(object="object_000", absorbed=("object_007",), share=0.8),
-        Repair(object="object_000", instances=(4,), divided="object_001"),
-        Repair(object="object_000", divided="object_008"),
+        Repair(object="object_000", instances=(4,), divided="object_001", share=0.93),
+        Repair(object="object_000", divided="object_008", share=0.7),
         Repair(object="object_000", instances=(4,), dropped=40, points=900, share=0.95),
         Repair(object="object_002", dropped=7, neighbor="object_003", points=90, share=0.5),
         Repair(object="object_001", instances=(3,), regained=1200, points=3000, share=0.75),
-        Repair(object="object_004", instances=(9,), unmasked=800),
+        Repair(object="object_004", instances=(9,), unmasked=800, share=0.66),
         Repair(object="object_005", unmasked=70),
         Repair(object="object_006", instances=(1, 2), smooth=0.8),
     )
@@ -380,15 +380,15 @@ def test_mended_masks_are_listed():
     text = report_html(dataclasses.replace(SCENE, scans=(*SCENE.scans[:-1], mended)), CONFIG)
     assert "friday: instances 3, 5 and 6 are object_001, in parts (92% on it)" in text
     assert "object_007 of the scan before and object_000 are one, in parts (80% on it)" in text
-    assert "friday: instance 4 is object_000 and object_001 in one mask" in text
-    assert "friday: one mask of the scan before held object_000 and object_008" in text
+    assert "friday: instance 4 is object_000 and object_001 in one mask (93% sure)" in text
+    assert "friday: one mask of the scan before held object_000 and object_008 (70% sure)" in text
     assert (
         "40 of 900 points of object_000 (instance 4) are floor or wall, and left out (95% within half the tolerance"
         in text
     )
     assert "7 of 90 points of object_002 (in an earlier scan) are object_003" in text
     assert "1200 points beside the 3000 of object_001 (instance 3) are part of it, and taken in (75%" in text
-    assert "friday: 800 points without a mask are object_004, as instance 9" in text
+    assert "friday: 800 points without a mask are object_004, as instance 9 (66% sure)" in text
     assert "friday: 70 points without a mask are object_005, in the scan before" in text
     assert "instances 1 and 2 are object_006, in parts that go on in one another (80% of their" in text
     assert "Masks are as they were given." in report_html(SCENE, CONFIG)
