@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from eval.data.truth import KnownScene
 from eval.scores.figures import Figure, Record
-from eval.scores.tracks import Track, said_changes, true_changes
+from eval.scores.tracks import Track, said_changes, sides
 
 MATCHES, CHANGES = (
     Figure(
@@ -43,10 +43,11 @@ def matches_told(scene: KnownScene, tracks: Sequence[Track]) -> list[Record]:
 
 
 def changes_told(scene: KnownScene, tracks: Sequence[Track]) -> list[Record]:
-    """Right is what really came or went; what counts neither way is left out, as in `changes_f1`."""
-    true, open_ = true_changes(scene)
-    return [
-        {CHANGES.key: t.alone[change[1]], CHANGES.over: float(change in true)}
-        for change, t in said_changes(scene, tracks).items()
-        if change not in open_ and change[1] in t.alone
-    ]
+    """Right is what the other scan's room really lacks, could anybody know it or not. Masks of no object are left out."""
+    found = list[Record]()
+    for (name, k, instance), t in said_changes(scene, tracks).items():
+        here, other = next(scans for kind, *scans in sides(k) if kind == name)
+        shown = next((o for o in scene.objects if instance in o.masks(here)), None)
+        if shown is not None and k in t.alone:
+            found.append({CHANGES.key: t.alone[k], CHANGES.over: float(other not in shown.T_scan_model)})
+    return found

@@ -51,10 +51,12 @@ def gone(visible):
     return dataclasses.replace(SCENE, objects=(first, *SCENE.objects[1:]))
 
 
-def test_a_change_is_right_if_the_object_came_or_went_and_open_where_nobody_can_know():
+def test_a_change_is_right_if_the_object_came_or_went_whoever_could_know_it():
     tracks = [track(0, alone={1: 0.9}), track(1, alone={1: 0.6}), track(None, 11, alone={1: 0.4})]
     assert told(changes_told(gone(visible=False), tracks), CHANGES) == [(0.4, 0.0), (0.9, 1.0), (0.6, 0.0)]
-    assert told(changes_told(gone(visible=True), tracks), CHANGES) == [(0.4, 0.0), (0.6, 0.0)]
+    assert told(changes_told(gone(visible=True), tracks), CHANGES) == [(0.4, 0.0), (0.9, 0.0), (0.6, 0.0)]
+    nothing = [track(77, alone={1: 0.9})]  # a mask of no object
+    assert told(changes_told(gone(visible=False), nothing), CHANGES) == []
     silent = dataclasses.replace(tracks[0], not_seen=frozenset({1}))  # says that nobody looked
     assert told(changes_told(gone(visible=False), [silent]), CHANGES) == []
 
