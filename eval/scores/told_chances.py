@@ -43,7 +43,7 @@ def matches_told(scene: KnownScene, tracks: Sequence[Track]) -> list[Record]:
 
 
 def changes_told(scene: KnownScene, tracks: Sequence[Track]) -> list[Record]:
-    """Right is what the other scan's room really lacks, could anybody know it or not. Masks of no object are left out."""
+    """Right is what the other scan's room really lacks, known or not. Masks of no object are left out."""
     found = list[Record]()
     for (name, k, instance), t in said_changes(scene, tracks).items():
         here, other = next(scans for kind, *scans in sides(k) if kind == name)
