@@ -8,7 +8,7 @@ the rotation error of scan k's observation, and the distance of the mesh made th
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -95,13 +95,23 @@ def scene_records(
 ) -> list[Record]:
     """One record for every object of the first scan and every number of scans."""
     records: list[Record] = []
-    for k, living in enumerate(living_scenes(scene, prior, config)):
-        tracks = tracks_of(reconstruct(prior, living, config))
+    for k, tracks in enumerate(tracks_after_every_scan(scene, prior, config)):
         for o in scene.objects:
             if o.instance.get(0, LOST) != LOST and o.mesh is not None:
                 track = track_with(tracks, 0, o.instance[0])
                 records.append({"scans": k + 1, **object_record(scene, o, track, k, right_deg, samples)})
     return records
+
+
+def tracks_after_every_scan(scene: KnownScene, prior: Prior, config: SceneConfig) -> Iterator[list[Track]]:
+    """What the method holds after each scan: nothing from a scan on that it cannot use, as one without any mask."""
+    told = 0
+    try:
+        for living in living_scenes(scene, prior, config):
+            yield tracks_of(reconstruct(prior, living, config))
+            told += 1
+    except ValueError:
+        yield from ([] for _ in range(told, len(scene.scans)))
 
 
 def object_record(
@@ -134,8 +144,8 @@ def true_surface(o: KnownObject) -> Float[np.ndarray, "n 3"]:
 
 
 def true_cloud(scene: KnownScene, o: KnownObject, last: int) -> Float[np.ndarray, "n 3"]:
-    """What was seen of an object up to scan `last`, model frame, under the true poses."""
-    seen = [(k, i) for k, i in o.instance.items() if k <= last and i != LOST]
+    """What was seen of an object in its first shape up to scan `last`, model frame, under the true poses."""
+    seen = [(k, i) for k, i in o.instance.items() if k <= last and i != LOST and o.same_shape(0, k)]
     clouds = [apply_pose(np.linalg.inv(o.T_scan_model[k]), scene.instance(k, i).points) for k, i in seen]
     return np.concatenate(clouds)
 

@@ -1,23 +1,23 @@
 """3RScan as a benchmark (paper §4): places of a split, the true associations, ambiguity chains, predicted masks.
 
-`<data>/3RScan.json`, or beside the folder of scans; `<data>/<scan>/…` as published: the evaluation's back-projected
-cloud where it is there, else the vertices of the annotated mesh. An object's model frame is the frame of the reference
-scan; that of objects which look alike, the pose of the one with the smallest id.
+`<data>/3RScan.json`, or beside the folder of scans; `<data>/<scan>/…` as published (`threerscan_cloud`). An object's
+model frame is the frame of the reference scan; that of objects which look alike, the pose of the one with the smallest
+id.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from pathlib import Path
 
 import numpy as np
 
 from eval.data.masks import associated
-from eval.data.threerscan_cloud import ANNOTATED, PREDICTED, has_published_cloud, read_published
+from eval.data.threerscan_cloud import read_scans
 from eval.data.threerscan_index import CATEGORIES, SYMMETRY_FOLDS, Place, Rescan, read_index
 from eval.data.truth import Benchmark, KnownObject, KnownScene
-from more2_jax.geometry.poses import Pose, apply_pose, rotation_error_deg
-from more2_jax.scans.read_scan import read_scan
+from more2_jax.geometry.poses import apply_pose, rotation_error_deg
 from more2_jax.storage.ply_files import read_mesh
 from more2_jax.types import Mesh, Scan
 from train.furniture.symmetry import SymmetryGroup
@@ -47,17 +47,19 @@ def threerscan(data: Path, *, split: str, predicted: bool) -> Benchmark:
 def read_place(data: Path, place: Place, *, predicted: bool = False) -> KnownScene:
     """One place: the reference scan first, rescans in the file's order; movable categories only.
 
-    `predicted` looks through predicted masks instead; each object is shown by the mask that overlaps it most.
+    `predicted` looks through predicted masks instead, all of them; each object is shown by the mask that overlaps it
+    most. A rescan in which nothing movable is annotated is left out, as in the published evaluation.
     """
-    folders = [data / name for name in (place.reference, *(r.id for r in place.rescans))]
-    poses = [np.eye(4), *(r.T_ref_rescan for r in place.rescans)]
-    scans = [movable(folder, T) for folder, T in zip(folders, poses, strict=True)]
+    first = read_scans(data / place.reference, np.eye(4), predicted=predicted)
+    later = [read_scans(data / r.id, r.T_ref_rescan, predicted=predicted) for r in place.rescans]
+    shown = [bool(movable(annotated).instances) for annotated, _ in later]
+    place = dataclasses.replace(place, rescans=tuple(itertools.compress(place.rescans, shown)))
+    read = [first, *itertools.compress(later, shown)]
+    scans = [movable(annotated) for annotated, _ in read]
     labels = [{i.id: i.label or "" for i in scan.instances} for scan in scans]
     objects = tuple(_object(data, place, i, labels, scans[0]) for i in sorted(labels[0]))
     scene = KnownScene(name=place.reference, scans=tuple(scans), objects=objects)
-    if not predicted:
-        return scene
-    return associated(scene, [read_predicted(folder, T) for folder, T in zip(folders, poses, strict=True)])
+    return associated(scene, [masked for _, masked in read if masked is not None]) if predicted else scene
 
 
 def true_mesh(data: Path, place: Place, id_: int, T_ref_model: np.ndarray) -> Mesh | None:
@@ -71,39 +73,29 @@ def true_mesh(data: Path, place: Place, id_: int, T_ref_model: np.ndarray) -> Me
     )
 
 
-def movable(folder: Path, T_ref_scan: Pose) -> Scan:
-    """A scan with its annotated instances of movable categories."""
-    published = has_published_cloud(folder)
-    scan = read_published(folder, T_ref_scan, ANNOTATED) if published else read_scan(folder, min_points=1)
-    kept = tuple(i for i in scan.instances if i.label in CATEGORIES)
-    return dataclasses.replace(scan, instances=kept)
-
-
-def read_predicted(folder: Path, T_ref_scan: Pose) -> Scan:
-    """A scan with all its predicted instances. Raises ValueError if there is no file of masks."""
-    if has_published_cloud(folder) and (folder / PREDICTED).is_file():
-        return read_published(folder, T_ref_scan, PREDICTED)
-    files = [folder / PREDICTED, folder / f"{folder.name}.txt", folder / f"{folder.name}.npz"]
-    masks = next((f for f in files if f.is_file()), None)
-    if masks is None:
-        raise ValueError(f"{folder}: no predicted masks; needed {', '.join(f.name for f in files)}")
-    return read_scan(folder, min_points=1, masks=masks)
+def movable(scan: Scan) -> Scan:
+    """A scan with its instances of movable categories."""
+    return dataclasses.replace(scan, instances=tuple(i for i in scan.instances if i.label in CATEGORIES))
 
 
 def _object(data: Path, place: Place, id_: int, labels: list[dict[int, str]], reference: Scan) -> KnownObject:
-    """An object of the reference, with what is annotated of it in every rescan."""
+    """An object of the reference, with what is annotated of it in every rescan.
+
+    Where its shape changed and no motion is listed, it has the pose of what did not move: it counts for matching alone.
+    """
     root, T_ref_model = _model_frame(place, id_)
     poses, instance, moved, rigid = {0: T_ref_model}, {0: id_}, {0: False}, set[int]()
-    symmetry = 0
+    reshaped, symmetry = set[int](), 0
     for k, rescan in enumerate(place.rescans, start=1):
         found = [i for i in labels[k] if rescan.instance_in_reference(i) == id_]
-        if not found or id_ in rescan.removed or found[0] in rescan.nonrigid:
+        if not found or id_ in rescan.removed:
             continue
         instance[k] = found[0]
         poses[k] = np.linalg.inv(rescan.pose_of(found[0])) @ T_ref_model
         moved[k] = has_moved(rescan, found[0])
         listed = [m.symmetry for m in rescan.moved if m.instance_ref == id_]
         rigid |= {k} if listed else set()
+        reshaped |= {k} if id_ in rescan.nonrigid and not listed else set()
         symmetry = max(symmetry, *listed[:1], 0)
     center = _center(reference, id_, T_ref_model)
     return KnownObject(
@@ -117,6 +109,7 @@ def _object(data: Path, place: Place, id_: int, labels: list[dict[int, str]], re
         forgiven_deg=FORGIVEN_DEG.get(symmetry, ()),
         moved=moved,
         rigid=frozenset(rigid),
+        reshaped=frozenset(reshaped),
     )
 
 

@@ -79,7 +79,7 @@ class Rescan:
     id: str
     T_ref_rescan: Float[np.ndarray, "4 4"]  # of what did not move
     moved: tuple[MovedObject, ...] = ()
-    nonrigid: tuple[int, ...] = ()  # instances that changed shape
+    nonrigid: tuple[int, ...] = ()  # instances of the reference that changed shape
     removed: tuple[int, ...] = ()  # instances of the reference that are gone
 
     def instance_in_reference(self, instance: int) -> int:

@@ -12,6 +12,7 @@ from dataset_writers.threerscan import column_major, write_annotated_mesh, write
 from known_scenes import pose
 from published_folder import SCENE, write_published
 
+from eval import accumulation
 from eval.data.flyingshape import digest, flyingshape
 from eval.data.masks import LOST
 from eval.data.threerscan import threerscan
@@ -176,17 +177,25 @@ def test_predicted_masks_show_the_objects_they_overlap_most(places):
     assert [len(s.instances) for s in scene.scans] == [3, 2]  # the reference's plant is a distractor
 
 
+DENSE = {n: np.concatenate([points + d for d in (0.001, 0.002, 0.003, 0.004)]) for n, points in SHAPE.items()}
+
+
+def write_published_cloud(folder, poses, T_ref_scan, shapes):
+    """Points in the reference's frame with their labels; returns the labels."""
+    points = np.concatenate([apply_pose(T_ref_scan @ T, shapes[i]) for i, T in poses.items()])
+    write_ply(folder / "pointcloud.instances.align.ply", vertex_columns(points))
+    ids = np.concatenate([np.full(len(shapes[i]), i) for i in poses])
+    np.savez(folder / "pointcloud.labels.npz", objectId=ids)
+    return ids
+
+
 @pytest.fixture
 def published(places, tmp_path):
     """The same place with the published evaluation's clouds: other points than the mesh's, in the reference's frame."""
     folder = tmp_path / "3rscan"
     shutil.copytree(places, folder)
     for name, poses, T in (("ref", T_REF, np.eye(4)), ("later", T_RESCAN, T_WORLD)):
-        shapes = {i: SHAPE[LABEL[i]][:100] + 0.001 for i in poses}
-        points = np.concatenate([apply_pose(T @ poses[i], p) for i, p in shapes.items()])
-        write_ply(folder / name / "pointcloud.instances.align.ply", vertex_columns(points))
-        ids = np.concatenate([np.full(100, i) for i in poses])
-        np.savez(folder / name / "pointcloud.labels.npz", objectId=ids)
+        ids = write_published_cloud(folder / name, poses, T, {i: DENSE[LABEL[i]] for i in poses})
         np.savez(folder / name / "mask3d.labels.npz", objectId=np.where(ids == 3, 0, ids))
     return folder
 
@@ -194,10 +203,10 @@ def published(places, tmp_path):
 def test_published_clouds_are_read_in_their_scans_own_frames(published):
     scene = threerscan(published, split="validation", predicted=False).read("ref")
     one, two, table = scene.objects
-    assert {len(i.points) for s in scene.scans for i in s.instances} == {100}
+    assert {len(i.points) for s in scene.scans for i in s.instances} == {1200}
     for a, b in ((one, one), (two, two), (table, table), (two, one)):
         assert scores(scene, a, b)["re_deg.paper"] == pytest.approx(0, abs=1e-4)
-    expected = apply_pose(T_RESCAN[1], SHAPE["chair"][:100] + 0.001)
+    expected = apply_pose(T_RESCAN[1], DENSE["chair"])
     np.testing.assert_allclose(scene.instance(1, 1).points, expected, atol=1e-5)
 
 
@@ -206,10 +215,92 @@ def test_published_predicted_masks_are_of_the_published_cloud(published):
     one, two, table = scene.objects
     assert set(table.instance.values()) == {LOST}
     assert one.instance == {0: 1, 1: 1} and two.instance == {0: 2, 1: 2}
-    assert len(scene.instance(1, 1).points) == 100
+    assert len(scene.instance(1, 1).points) == 1200
     np.savez(published / "later" / "mask3d.labels.npz", objectId=np.zeros(900, int))
-    with pytest.raises(ValueError, match="objectId is for 900 points; the scan has 300"):
+    with pytest.raises(ValueError, match="objectId is for 900 points; the scan has 3600"):
         threerscan(published, split="validation", predicted=True).read("ref")
+
+
+def test_a_scan_without_any_predicted_mask_is_one(published):
+    """Its objects have no mask and stay in all denominators; programs go on."""
+    np.savez(published / "later" / "mask3d.labels.npz", objectId=np.zeros(3600, int))
+    scene = threerscan(published, split="validation", predicted=True).read("ref")
+    assert scene.scans[1].instances == () and len(scene.scans[1].background) == 3600
+    assert {o.instance[1] for o in scene.objects} == {LOST}
+    assert match_scores(scene, 0, 1, {})["pairs"] == 3
+
+
+def test_a_scan_that_cannot_be_used_ends_what_accumulates(published, monkeypatch, unchecked):
+    def grows(scene, prior, config):
+        yield "after one scan"
+        raise ValueError("no instances")
+
+    monkeypatch.setattr(accumulation, "living_scenes", grows)
+    monkeypatch.setattr(accumulation, "reconstruct", lambda prior, living, config: living)
+    monkeypatch.setattr(accumulation, "tracks_of", lambda living: [living])
+    scene = threerscan(published, split="validation", predicted=True).read("ref")
+    assert list(accumulation.tracks_after_every_scan(scene, None, None)) == [["after one scan"], []]
+
+
+def test_masks_of_the_vertices_are_compared_on_the_vertices(published):
+    """Beside a published cloud without masks of its own: the truth is then that of the vertices, too."""
+    for name, rows in (("ref", 1200), ("later", 900)):
+        (published / name / "mask3d.labels.npz").unlink()
+        np.savez(published / name / f"{name}.npz", objectId=np.repeat(np.arange(rows // 300) + 7, 300))
+    scene = threerscan(published, split="validation", predicted=True).read("ref")
+    assert [o.instance for o in scene.objects] == [{0: 7, 1: 7}, {0: 8, 1: 8}, {0: 9, 1: 9}]
+    assert {len(i.points) for s in scene.scans for i in s.instances} == {300}
+
+
+def test_instances_below_1024_points_are_no_instances_of_the_published_cloud(published):
+    poses, shapes = T_RESCAN, {i: DENSE[LABEL[i]] for i in T_RESCAN}
+    for count, seen in ((1024, True), (1023, False)):
+        write_published_cloud(published / "later", poses, T_WORLD, shapes | {2: shapes[2][:count]})
+        scene = threerscan(published, split="validation", predicted=False).read("ref")
+        assert (1 in scene.objects[1].instance) == seen
+        assert len(scene.scans[1].instances) == 2 + seen
+
+
+def test_masks_of_very_many_points_keep_what_they_share(published):
+    """A scan thins large instances. Masks of which one holds nine tenths of the other overlap by that much after it."""
+    rng = np.random.default_rng(3)
+    shapes = {i: rng.uniform(-0.4, 0.4, (12_000, 3)) for i in (1, 2, 3)}
+    for name, T in (("ref", np.eye(4)), ("later", T_WORLD)):
+        poses = {i: T_RESCAN[i] if name == "later" else T_REF[i] for i in shapes}
+        ids = write_published_cloud(published / name, poses, T, shapes)
+        ids[::10] = 0
+        np.savez(published / name / "mask3d.labels.npz", objectId=ids)
+    data = {p: threerscan(published, split="validation", predicted=p).read("ref") for p in (False, True)}
+    assert all(o.instance == {0: i, 1: i} for o, i in zip(data[True].objects, (1, 2, 3), strict=True))
+    for i in shapes:
+        true, masked = (set(map(tuple, data[p].instance(1, i).points.tolist())) for p in (False, True))
+        assert 7_000 < len(masked) < len(true) <= 10_000
+        assert masked < true and len(masked) == pytest.approx(0.9 * len(true), rel=0.02)
+
+
+def test_what_changed_its_shape_is_matched_and_not_registered(places, tmp_path):
+    """As the published evaluation has it, which knows no nonrigid change when it matches; a listed motion counts."""
+    shutil.copytree(places, tmp_path / "3rscan")
+    index = json.loads((places / "3RScan.json").read_text())
+    index[0]["scans"][0]["nonrigid"] = [1, 3]  # the chair's motion is listed, the table's is not
+    (tmp_path / "3rscan" / "3RScan.json").write_text(json.dumps(index))
+    scene = threerscan(tmp_path / "3rscan", split="validation", predicted=False).read("ref")
+    assert match_scores(scene, 0, 1, {1: 1, 2: 2, 3: 3})["pairs"] == 3
+    assert [p.object.name for p in true_pairs(scene, "all")] == ["instance_1", "instance_2"]
+
+
+def test_rescans_without_movable_furniture_are_left_out(places, tmp_path):
+    shutil.copytree(places, tmp_path / "3rscan")
+    write_scan(tmp_path / "3rscan" / "bare", {9: T_REF[9]})
+    index = json.loads((places / "3RScan.json").read_text())
+    bare = {"reference": "bare", "transform": column_major(np.eye(4))}
+    index[0]["scans"].insert(0, bare)
+    (tmp_path / "3rscan" / "3RScan.json").write_text(json.dumps(index))
+    scene = threerscan(tmp_path / "3rscan", split="validation", predicted=False).read("ref")
+    assert [s.name for s in scene.scans] == ["ref", "later"]
+    np.testing.assert_allclose(
+        scene.scans[1].instances[0].points, apply_pose(T_RESCAN[1], SHAPE["chair"]), atol=1e-5
+    )
 
 
 def test_pairs_that_3rscan_lists_as_rigid(places):
