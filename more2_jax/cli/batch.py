@@ -15,6 +15,7 @@ from more2_jax.cli.manifest import RottenRow, SceneJob, read_manifest
 from more2_jax.cli.options import Reporting
 from more2_jax.cli.session import Session, keep_compiled_programs
 from more2_jax.cli.tables import write_table
+from more2_jax.whole_file import check_writable
 from more2_jax.workers.dealing import Handler, Team, work_through
 from more2_jax.workers.local import LocalTeam
 from more2_jax.workers.ray_cluster import RayTeam
@@ -51,6 +52,7 @@ def run_batch(
     if workers is not None and workers < 1:
         raise ValueError(f"--workers {workers}; needed 1 or more")
     rows = read_manifest(manifest, out)
+    check_writable(out / RESULTS)
     out.mkdir(parents=True, exist_ok=True)
     results = Results(session=Session(Reporting(quiet=quiet)), count=len(rows))
     todo: list[SceneJob] = []

@@ -10,8 +10,9 @@ import psutil
 import pytest
 from command_line import FEW_STEPS, boxes, refused, run_quickly, scan_file
 from inline_team import Inline
+from stages_by_mask import stages_by_mask
 
-from more2_jax import scene
+from more2_jax import report, scene
 from more2_jax.cli import batch
 from more2_jax.cli.main import main
 from more2_jax.cli.manifest import RottenRow, SceneJob, read_manifest
@@ -91,6 +92,32 @@ def test_each_scene_is_what_run_makes_of_it_and_a_rotten_row_costs_itself(place,
     assert run_quickly(place / "a.ply", place / "b.ply", out=place / "plain", prior=tiny) == 0
     assert told_of(out / "one") == told_of(place / "plain")
     assert sorted(p.name for p in out.iterdir()) == ["alone", "one", "results.csv"]
+
+
+def test_one_rotten_row_in_a_hundred(place, tiny, inline, capsys, monkeypatch):
+    """99 scenes are there and one line is said; the next call tries the one alone, and with its scan mended all are."""
+    monkeypatch.setattr(report, "report_html", lambda *_: "")  # takes a third of the time
+    out, names = place / "all", [f"room_{k:02d}" for k in range(100)]
+    rows = [f"{n},{'cut.ply' if n == 'room_42' else 'a.ply'},{tiny}" for n in names]
+    path = written(place, tiny, *rows, columns="name,scans,prior")
+    whole = (place / "a.ply").read_bytes()
+    (place / "cut.ply").write_bytes(whole[: len(whole) // 2])
+    with stages_by_mask():
+        assert go(path, out) == 1
+        told = capsys.readouterr()
+        (line,) = told.err.splitlines()
+        assert line.startswith("error: row 43 (room_42): ") and "cut.ply" in line
+        assert "99 scenes done, 0 were finished before, 1 failed" in told.out
+        scenes = {p.parent.name: p.stat().st_mtime_ns for p in out.glob("*/scene.json")}
+        assert sorted(scenes) == [n for n in names if n != "room_42"]
+        assert [r["name"] for r in results(out) if r["status"] == "failed"] == ["room_42"]
+        assert go(path, out) == 1
+        assert inline[-1].tasks == ["room_42"] and capsys.readouterr().err == told.err
+        (place / "cut.ply").write_bytes(whole)
+        assert go(path, out) == 0
+    assert [r["status"] for r in results(out)] == ["done" if n == "room_42" else "kept" for n in names]
+    assert {n: (out / n / "scene.json").stat().st_mtime_ns for n in scenes} == scenes
+    assert sorted(p.name for p in out.iterdir()) == ["results.csv", *names]
 
 
 def told_of(folder):
