@@ -41,7 +41,13 @@ def threerscan(data: Path, *, split: str, predicted: bool) -> Benchmark:
         facts={"dataset": "3RScan", "regime": split, "masks": "predicted" if predicted else "annotated"},
         upright=True,
         right_deg=RIGHT_DEG,
+        files=lambda name: folders_of(data, places[name]),
     )
+
+
+def folders_of(data: Path, place: Place) -> list[Path]:
+    """Of its scans: the reference first, rescans in the file's order."""
+    return [data / name for name in (place.reference, *(r.id for r in place.rescans))]
 
 
 def read_place(data: Path, place: Place, *, predicted: bool = False) -> KnownScene:
@@ -49,7 +55,7 @@ def read_place(data: Path, place: Place, *, predicted: bool = False) -> KnownSce
 
     `predicted` looks through predicted masks instead; each object is shown by the mask that overlaps it most.
     """
-    folders = [data / name for name in (place.reference, *(r.id for r in place.rescans))]
+    folders = folders_of(data, place)
     poses = [np.eye(4), *(r.T_ref_rescan for r in place.rescans)]
     scans = [movable(folder, T) for folder, T in zip(folders, poses, strict=True)]
     labels = [{i.id: i.label or "" for i in scan.instances} for scan in scans]

@@ -17,7 +17,15 @@ from typing import Any
 from eval.harness.options import Options
 from eval.harness.run_folder import RunFolder, write_json
 
-ELSEWHERE = ("data", "out", "shard", "workers", "ray", "fresh")  # options that change no result
+ELSEWHERE = (
+    "data",
+    "out",
+    "shard",
+    "workers",
+    "ray",
+    "scene_minutes",
+    "fresh",
+)  # options that change no result
 
 
 @dataclass(frozen=True, kw_only=True)

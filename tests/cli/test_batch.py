@@ -120,6 +120,15 @@ def test_one_rotten_row_in_a_hundred(place, tiny, inline, capsys, monkeypatch):
     assert sorted(p.name for p in out.iterdir()) == ["results.csv", *names]
 
 
+def test_the_largest_scene_begins_first_and_the_results_are_in_the_order_of_the_rows(place, tiny, inline):
+    scan_file(place / "large.ply", *boxes(count=3))
+    rows = ["small,a.ply", "two,a.ply;b.ply", "large,a.ply;large.ply", "also small,b.ply"]
+    with stages_by_mask():
+        assert go(written(place, tiny, *rows), place / "all") == 0
+    assert inline[-1].tasks == ["large", "two", "small", "also small"]
+    assert [r["name"] for r in results(place / "all")] == ["small", "two", "large", "also small"]
+
+
 def told_of(folder):
     """scene.json without the seconds, and the bytes of all objects and codes."""
     content = json.loads((folder / "scene.json").read_text())
@@ -238,9 +247,9 @@ def test_a_file_that_is_no_manifest_is_one_line(place, capsys, text, says):
     assert not (place / "all").exists()
     assert "No such file" in refused(capsys, "batch", place / "gone.csv", "--out", place / "all")
     assert "Parquet needs pyarrow" in refused(capsys, "batch", place / "gone.parquet", "--out", place / "all")
-    assert "--workers 0; needed 1 or more" in refused(
-        capsys, "batch", path, "--out", place / "all", "--workers", 0
-    )
+    for option, says in (("--workers", "1 or more"), ("--scene-minutes", "more than 0")):
+        said = refused(capsys, "batch", path, "--out", place / "all", option, 0)
+        assert f"{option} 0; needed {says}" in said
 
 
 @pytest.mark.slow

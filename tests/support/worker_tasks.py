@@ -30,6 +30,6 @@ class Square:
             raise ValueError("two\nlines")
         if task == "mistake":
             raise KeyError("unforeseen")
-        if task == "sleeps":
+        if task == "sleeps" or (task == "sleeps once" and tries == 0):
             time.sleep(60)
         return (task**2 if isinstance(task, int) else task), os.getpid()
