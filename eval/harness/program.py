@@ -18,13 +18,14 @@ from eval.harness.options import Options
 from eval.harness.results import circumstances_now, finish
 from eval.harness.run_folder import RunFolder, claim
 from eval.harness.runs import Run, Work, keep, progress_bar, read_chunk, run_scenes, unfinished_chunks
-from eval.harness.shards import shard_of, write_part
+from eval.harness.shards import write_part
 from eval.scores.figures import Figure, Record, Row
 from more2_jax.cli.session import keep_compiled_programs
 from more2_jax.workers.dealing import Handler, Team, work_through
 from more2_jax.workers.largest_first import largest_first
 from more2_jax.workers.local import LocalTeam
 from more2_jax.workers.ray_cluster import RayTeam
+from more2_jax.workers.shares import shard_of
 from more2_jax.workers.time_limit import limit_of
 from train.run.program import run
 

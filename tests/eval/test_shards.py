@@ -18,9 +18,9 @@ from eval.harness.options import Options
 from eval.harness.program import Program, Summary, carry_out
 from eval.harness.run_folder import RunFolder
 from eval.harness.runs import open_run, unfinished_chunks
-from eval.harness.shards import shard_of
 from eval.scores.figures import Figure
 from more2_jax.network.prior import save_prior
+from more2_jax.workers.shares import shard_of
 
 NAMES = [f"scene_{k}" for k in range(7)]
 DATED = ("date",)  # of results.json: when, not what
