@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import json
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -65,15 +65,7 @@ def run_batch(
     check_writable(out / RESULTS)
     out.mkdir(parents=True, exist_ok=True)
     results = Results(session=Session(Reporting(quiet=quiet)), count=len(rows))
-    todo: list[SceneJob] = []
-    for row in rows:
-        if isinstance(row, RottenRow):
-            results.failed(row, row.error)
-        elif is_finished(row):
-            results.finished(row, "kept")
-        else:
-            todo.append(row)
-    todo = largest_first(todo, lambda job: job.scans)
+    todo = unfinished(rows, results)
     try:
         for outcome in work_through(todo, team_of(workers, ray, len(todo), limit_s)) if todo else ():
             if outcome.answer.error:
@@ -83,6 +75,19 @@ def run_batch(
     finally:
         path = write_table(out / RESULTS, COLUMNS, [results.rows[k] for k in sorted(results.rows)])
     return results.summed_up(path)
+
+
+def unfinished(rows: Sequence[SceneJob | RottenRow], results: Results) -> list[SceneJob]:
+    """The scenes that are left to build, the largest first; what the other rows came to is noted."""
+    todo: list[SceneJob] = []
+    for row in rows:
+        if isinstance(row, RottenRow):
+            results.failed(row, row.error)
+        elif is_finished(row):
+            results.finished(row, "kept")
+        else:
+            todo.append(row)
+    return largest_first(todo, lambda job: job.scans)
 
 
 @dataclass
