@@ -17,7 +17,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -30,7 +30,7 @@ import tyro
 from eval.harness.results import cost, write_rows
 from eval.scores.figures import Row
 from more2_jax.config import load_config
-from more2_jax.network.prior import init_prior, load_prior, save_prior
+from more2_jax.network.prior import Prior, init_prior, load_prior, save_prior
 from more2_jax.storage.ply_files import write_points
 from more2_jax.storage.scene_folder import load_scene, stored_at
 from train.run.program import run
@@ -86,8 +86,8 @@ class Place:
 
     folder: Path
 
-    def prepare(self) -> None:
-        """Writes it."""
+    def prepare(self, prior: Prior | None = None) -> None:
+        """Writes it; the weights are the smallest random ones, unless some are given."""
         self.folder.mkdir(parents=True, exist_ok=True)
         rng = np.random.default_rng(0)
         clouds = [rng.uniform(-0.5, 0.5, (100, 3)) * s for s in SIZES_M]
@@ -96,8 +96,9 @@ class Place:
             write_points(
                 self.folder / f"{name}.ply", points, np.repeat(np.arange(count) + 1, 100), "instance"
             )
-        config = load_config(TINY, TrainingRun).model
-        save_prior(init_prior(config, jax.random.key(0), "tiny"), self.folder / "tiny.npz")
+        if prior is None:
+            prior = init_prior(load_config(TINY, TrainingRun).model, jax.random.key(0), "tiny")
+        save_prior(prior, self.folder / "tiny.npz")
         (self.folder / "few.yaml").write_text(FEW_STEPS, encoding="utf-8")
         (self.folder / "train.yaml").write_text(FEW_TRAINING_STEPS, encoding="utf-8")
         rows = [f"room_{k},a.ply;{b}.ply,few.yaml,tiny.npz" for k, b in enumerate("bc")]
@@ -189,7 +190,7 @@ def process_words(place: Place, command: Command, scenes: Path) -> list[str]:
 
 
 def one_moment(place: Place, command: Command, delay_s: float, expected: dict[str, bytes]) -> str:
-    """What is wrong after a kill, or after going on; nothing if all is right."""
+    """What is wrong after a kill that many seconds later, or after going on; nothing if all is right."""
     scenes = fresh(place, command, "killed")
     words = process_words(place, command, scenes)
     process = subprocess.Popen(
@@ -198,6 +199,19 @@ def one_moment(place: Place, command: Command, delay_s: float, expected: dict[st
     time.sleep(delay_s)
     os.killpg(process.pid, signal.SIGKILL)
     process.communicate()
+
+    def again() -> str:
+        done = subprocess.run(words, capture_output=True, text=True)
+        return done.stderr.strip() if done.returncode else ""
+
+    return wrong_after(command, scenes, expected, again)
+
+
+def wrong_after(command: Command, scenes: Path, expected: dict[str, bytes], again: Callable[[], str]) -> str:
+    """What is wrong on disk after a kill, or once `again` has gone on; nothing if all is right.
+
+    `again` gives the same command, and returns what that was refused with.
+    """
     try:
         found = [load_scene(folder)[0] for folder in scene_folders(scenes)]
         opens(scenes)
@@ -206,9 +220,8 @@ def one_moment(place: Place, command: Command, delay_s: float, expected: dict[st
     if command in STARTS_WITH_TWO and not found:
         return "the scene is lost"
     if command != "add" or len(found[0].scans) == 2:  # the third scan is not added twice
-        again = subprocess.run(words, capture_output=True, text=True)
-        if again.returncode:
-            return again.stderr.strip()
+        if refused := again():
+            return refused
     else:
         settle(scenes / "room")
     after = content(scenes)
@@ -216,10 +229,13 @@ def one_moment(place: Place, command: Command, delay_s: float, expected: dict[st
 
 
 def opens(scenes: Path) -> None:
-    """Reads exports and weights. Raises ValueError where one is cut short."""
-    for path in scenes.glob("*.glb"):
-        trimesh.load_scene(path)
-    for path in scenes.glob("prior/*.npz"):
+    """Reads exports and weights, but no hidden ones, which are half written. ValueError where one is cut short."""
+    for path in scenes.glob("[!.]*.glb"):
+        try:
+            trimesh.load_scene(path)
+        except (ValueError, IndexError) as error:  # NumPy's, of a file without a head
+            raise ValueError(f"{path}: {error}") from error
+    for path in scenes.glob("prior/[!.]*.npz"):
         load_prior(path)
 
 

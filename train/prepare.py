@@ -77,7 +77,7 @@ def make_shards(
             path = out / f"shard_{start // SHARD:03d}"
             if path.exists():
                 continue
-            results = pool.map(prepare, meshes[start : start + SHARD])
+            results = list(pool.map(prepare, meshes[start : start + SHARD]))
             report.rejected.update({r.name: r.reason for r in results if isinstance(r, Rejected)})
             report.write()
             write_shard(path, [r for r in results if isinstance(r, Shape)])

@@ -11,14 +11,10 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-import os
 import sys
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import lru_cache, partial
-from multiprocessing import get_context
+from functools import cached_property, lru_cache, partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -26,9 +22,10 @@ import numpy as np
 import tyro
 from rich.progress import track
 
-from more2_jax.whole_file import whole_file
-from train.furniture.closed_models import cache_name, make_cached, read_cached, read_models
+from more2_jax.workers.shares import shard_of
+from train.furniture.closed_models import atomically, cache_name, make_cached, read_cached, read_models
 from train.furniture.collections import SourceMesh
+from train.furniture.parallel_map import Workers
 from train.rooms.fused_scan import ScanSettings
 from train.rooms.mask_flaws import MASKS, Masks
 from train.rooms.real_files import write_real_scene
@@ -80,21 +77,46 @@ class Settings:
     """Folder of closed models, to share between benchmarks; inside `out` otherwise."""
     workers: int = 0
     """Processes; 0 for one a core."""
+    ray: str | None = None
+    """Address of a Ray cluster to spread the work over instead ("local" starts one here)."""
+    shard: str = "1/1"
+    """i/n: this process makes the i-th of n shares of the scenes, from 1. Who finds all scenes there at its end
+    writes index.json and LICENSES.md; so does the same command without --shard."""
 
 
 def main(settings: Annotated[Settings, tyro.conf.arg(name="")]) -> None:
     """Writes scenes with ground truth, index.json, LICENSES.md and report.json (models left out, and why)."""
-    s = settings
+    s, shard = settings, shard_of(settings.shard)
+    unreadable: dict[str, str] = {}
+    job = job_of(s, unreadable)
+    claim(job)
+    with Workers(s.workers, s.ray, shared=job) as pool:
+        rejected = check_models(job, pool)
+        _write(s.out / "report.json", {"rejected": rejected, "unreadable": unreadable})
+        make_scenes(shard.of(range(s.scenes)), pool)
+    if missing := [n for n in range(s.scenes) if not (s.out / _name(n) / "scene.json").exists()]:
+        print(f"shard {shard}: its scenes are in {s.out}; {len(missing)} of other shards are not there yet")
+        return
+    digests = {_name(n): _digest(s.out / _name(n)) for n in range(s.scenes)}
+    _write(s.out / "index.json", {**job.facts, "scenes": digests})
+    write_licenses(s.out, s.attribution)
+    usable = len(job.meshes) - len(rejected)
+    print(f"{s.scenes} scenes of {s.scans} scans from {usable} models, {len(rejected)} rejected, in {s.out}")
+
+
+def job_of(s: Settings, unreadable: dict[str, str]) -> Job:
+    """What the settings ask for; names of models that cannot be read go into `unreadable`, with the reason.
+
+    Raises ValueError if they do not fit together, or there are no models.
+    """
     regime, masks, crowded = _regime(s.regime), _masks(s.regime, s.masks), _lived_in(s)
-    room_m = s.room_m if regime == "real" or s.room_m else ROOM_M
     check_scans(regime, s.scans)
     if s.scenes < 1 or s.seed < 0 or min(s.room_m or ROOM_M) <= 0:
         raise ValueError(
             f"{s.scenes} scenes, seed {s.seed}, room {s.room_m}; needed positive numbers, seed from 0"
         )
-    unreadable: dict[str, str] = {}
     meshes = read_models(s.source, up=s.up, longest_m=s.longest_m, license=s.license, unreadable=unreadable)
-    job = Job(
+    return Job(
         meshes=tuple(meshes),
         cache=s.cache or s.out / "models",
         out=s.out,
@@ -102,20 +124,11 @@ def main(settings: Annotated[Settings, tyro.conf.arg(name="")]) -> None:
         free=s.free,
         scans=s.scans,
         seed=s.seed,
-        room_m=room_m,
+        room_m=s.room_m if regime == "real" or s.room_m else ROOM_M,
         masks=masks,
         lived_in=crowded,
         reshaped=_reshaped(s),
     )
-    claim(job)
-    with processes(job, s.workers) as pool:
-        rejected = check_models(job, pool)
-        _write(s.out / "report.json", {"rejected": rejected, "unreadable": unreadable})
-        digests = make_scenes(job, s.scenes, pool)
-    _write(s.out / "index.json", {**job.facts, "scenes": digests})
-    write_licenses(s.out, s.attribution)
-    usable = len(meshes) - len(rejected)
-    print(f"{s.scenes} scenes of {s.scans} scans from {usable} models, {len(rejected)} rejected, in {s.out}")
 
 
 def _regime(name: str) -> Regime:
@@ -154,7 +167,7 @@ def _reshaped(s: Settings) -> float:
     return s.reshaped
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)  # itself alone is equal: what is read for it is kept
 class Job:
     """Everything that scenes depend on, but their number."""
 
@@ -170,7 +183,7 @@ class Job:
     lived_in: bool = False
     reshaped: float = 0.0
 
-    @property
+    @cached_property
     def facts(self) -> dict[str, Any]:
         """Settings for scene.json and index.json; `models` is a digest of the meshes."""
         models = hashlib.sha1("\n".join(f"{m.name} {cache_name(m)}" for m in self.meshes).encode())
@@ -198,50 +211,33 @@ def claim(job: Job) -> None:
     _write(settings, job.facts)
 
 
-_job: Job | None = None  # of this worker process
-
-
-def _start(job: Job) -> None:
-    global _job
-    _job = job
-
-
-@contextmanager
-def processes(job: Job, workers: int) -> Iterator[ProcessPoolExecutor]:
-    """Worker processes that know the job; spawned, since a fork after threads have started may hang."""
-    pool = ProcessPoolExecutor(
-        workers or os.cpu_count(), mp_context=get_context("spawn"), initializer=_start, initargs=(job,)
-    )
-    try:
-        yield pool
-    finally:
-        pool.shutdown(cancel_futures=True)
-
-
-def check_models(job: Job, pool: ProcessPoolExecutor) -> dict[str, str]:
+def check_models(job: Job, pool: Workers) -> dict[str, str]:
     """Closes every model once; the names of those that cannot be used, with the reason."""
     reasons = pool.map(partial(make_cached, cache=job.cache), job.meshes)
     shown = track(reasons, "models", total=len(job.meshes), disable=not sys.stdout.isatty())
     return {m.name: reason for m, reason in zip(job.meshes, shown, strict=True) if reason is not None}
 
 
-def make_scenes(job: Job, count: int, pool: ProcessPoolExecutor) -> dict[str, str]:
-    """Writes the scenes that are not there yet; name → digest of all."""
-    names = [f"scene_{k:04d}" for k in range(count)]
-    digests = pool.map(make_scene, range(count))
-    shown = track(digests, "scenes", total=count, disable=not sys.stdout.isatty())
-    return dict(zip(names, shown, strict=True))
+def make_scenes(numbers: Sequence[int], pool: Workers) -> None:
+    """Writes the scenes that are not there yet."""
+    made = pool.map_shared(make_scene, numbers)
+    for _ in track(made, "scenes", total=len(numbers), disable=not sys.stdout.isatty()):
+        pass
 
 
-def make_scene(number: int) -> str:
-    """Makes and writes one scene of this process's job; returns its digest. A finished one is left alone."""
-    if _job is None:
-        raise RuntimeError("make_scene outside a worker process")
-    job = _job
-    name = f"scene_{number:04d}"
-    done = job.out / name / "scene.json"
-    if done.exists():
-        return json.loads(done.read_text())["digest"]
+def _name(number: int) -> str:
+    return f"scene_{number:04d}"
+
+
+def _digest(folder: Path) -> str:
+    return json.loads((folder / "scene.json").read_text())["digest"]
+
+
+def make_scene(job: Job, number: int) -> str:
+    """Makes and writes one scene; returns its digest. A finished one is left alone."""
+    name = _name(number)
+    if (job.out / name / "scene.json").exists():
+        return _digest(job.out / name)
     models, symmetry = usable_models(job)
     rng = np.random.default_rng((job.seed, number))
     facts = {**job.facts, "number": number}
@@ -286,14 +282,9 @@ def _furnished(
 
 
 @lru_cache(maxsize=1)
-def _usable(job_id: int) -> tuple[list[SourceMesh], dict[str, int]]:
-    assert _job is not None
-    return read_cached(_job.meshes, _job.cache)
-
-
 def usable_models(job: Job) -> tuple[list[SourceMesh], dict[str, int]]:
     """The closed models, read once a process, and their symmetry."""
-    return _usable(id(job))
+    return read_cached(job.meshes, job.cache)
 
 
 def write_licenses(out: Path, attribution: str | None) -> None:
@@ -314,13 +305,12 @@ def write_licenses(out: Path, attribution: str | None) -> None:
         ]
         lines += ["a unit; in regime `identical` also slightly rescaled.", ""]
         lines += [f"- {m}" for m in sorted(models)] + [""]
-    (out / "LICENSES.md").write_text("\n".join(lines), encoding="utf-8")
+    atomically(out / "LICENSES.md", "\n".join(lines).encode())
 
 
 def _write(path: Path, content: Sequence[Any] | dict[str, Any]) -> None:
-    """Whole or not at all."""
-    with whole_file(path) as partial_file:
-        partial_file.write_text(json.dumps(content, indent=1), encoding="utf-8")
+    """Whole or not at all; several shards may at a time."""
+    atomically(path, json.dumps(content, indent=1).encode())
 
 
 if __name__ == "__main__":

@@ -36,6 +36,7 @@ def flyingshape(folder: Path) -> Benchmark:
             facts={"dataset": "FlyingShape, published files", "regime": "paper"},
             upright=False,
             right_deg=RIGHT_DEG,
+            files=lambda name: published[name],
         )
     raise ValueError(
         f"{folder}: neither scene_*/scene.json (train.synthesize) nor scenes of npz files (published); needed one"
@@ -55,6 +56,7 @@ def open_flyingshape(folder: Path) -> Benchmark:
         facts={"dataset": "open FlyingShape", **facts},
         upright=not first.get("free", True),
         right_deg=RIGHT_DEG,
+        files=lambda name: [files[name]],
     )
 
 

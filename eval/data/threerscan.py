@@ -41,7 +41,13 @@ def threerscan(data: Path, *, split: str, predicted: bool) -> Benchmark:
         facts={"dataset": "3RScan", "regime": split, "masks": "predicted" if predicted else "annotated"},
         upright=True,
         right_deg=RIGHT_DEG,
+        files=lambda name: folders_of(data, places[name]),
     )
+
+
+def folders_of(data: Path, place: Place) -> list[Path]:
+    """Of its scans: the reference first, rescans in the file's order."""
+    return [data / name for name in (place.reference, *(r.id for r in place.rescans))]
 
 
 def read_place(data: Path, place: Place, *, predicted: bool = False) -> KnownScene:
@@ -50,8 +56,11 @@ def read_place(data: Path, place: Place, *, predicted: bool = False) -> KnownSce
     `predicted` looks through predicted masks instead, all of them; each object is shown by the mask that overlaps it
     most. A rescan in which nothing movable is annotated is left out, as in the published evaluation.
     """
-    first = read_scans(data / place.reference, np.eye(4), predicted=predicted)
-    later = [read_scans(data / r.id, r.T_ref_rescan, predicted=predicted) for r in place.rescans]
+    poses = [np.eye(4), *(r.T_ref_rescan for r in place.rescans)]
+    first, *later = [
+        read_scans(folder, T, predicted=predicted)
+        for folder, T in zip(folders_of(data, place), poses, strict=True)
+    ]
     shown = [bool(movable(annotated).instances) for annotated, _ in later]
     place = dataclasses.replace(place, rescans=tuple(itertools.compress(place.rescans, shown)))
     read = [first, *itertools.compress(later, shown)]

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -152,3 +153,4 @@ class Benchmark:
     facts: dict[str, Any]  # data set, regime, version: what a result belongs to
     upright: bool  # objects only turn about the vertical
     right_deg: float  # a rotation error below it is a success (paper §4)
+    files: Callable[[str], Sequence[Path]] = lambda name: ()  # files and folders of a scene, where known

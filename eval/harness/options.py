@@ -74,6 +74,9 @@ class Options:
     """Processes that stay alive over scenes; 0: this one alone. With --ray: actors, 0 for one a GPU, or one a core."""
     ray: str | None = None
     """Address of a Ray cluster whose actors do the work ("local" starts one here)."""
+    scene_minutes: float | None = None
+    """With --workers or --ray: a process that takes longer for a scene, or as many times longer for a chunk, is ended;
+    the chunk is tried once more, then fails. None: any time."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -18,12 +18,15 @@ from eval.harness.options import Options
 from eval.harness.results import circumstances_now, finish
 from eval.harness.run_folder import RunFolder, claim
 from eval.harness.runs import Run, Work, keep, progress_bar, read_chunk, run_scenes, unfinished_chunks
-from eval.harness.shards import shard_of, write_part
+from eval.harness.shards import write_part
 from eval.scores.figures import Figure, Record, Row
 from more2_jax.cli.session import keep_compiled_programs
 from more2_jax.workers.dealing import Handler, Team, work_through
+from more2_jax.workers.largest_first import largest_first
 from more2_jax.workers.local import LocalTeam
 from more2_jax.workers.ray_cluster import RayTeam
+from more2_jax.workers.shares import shard_of
+from more2_jax.workers.time_limit import limit_of
 from train.run.program import run
 
 Records = Mapping[str, Sequence[Record]]
@@ -67,11 +70,15 @@ def carry_out(program: Program, o: Options) -> None:
 
     Scenes that failed in a worker are told, one line each, and end the process with exit code 1.
     """
-    shard = shard_of(o.shard)
+    shard, elsewhere = shard_of(o.shard), bool(o.workers) or o.ray is not None
+    if limit_of(o.scene_minutes) and not elsewhere:
+        raise ValueError(
+            f"--scene-minutes {o.scene_minutes:g}; needed --workers or --ray, whose processes it ends"
+        )
     current, work = program.prepare(o)
     claim(current.out, current.settings, fresh=o.fresh)
     write_part(current, o, circumstances_now())
-    if o.workers or o.ray is not None:
+    if elsewhere:
         run_elsewhere(current, o)
     else:
         run_scenes(current, o, work)
@@ -109,17 +116,25 @@ class ChunkWorker:
         return lambda names: list(work(read_chunk(current, o, names)))
 
 
+def team_of(maker: ChunkWorker, o: Options) -> Team:
+    """Local processes, or actors of a cluster."""
+    limit_s = limit_of(o.scene_minutes and o.scene_minutes * o.chunk)
+    return (
+        LocalTeam(maker, o.workers, limit_s) if o.ray is None else RayTeam(maker, o.ray, o.workers, limit_s)
+    )
+
+
 def run_elsewhere(current: Run, o: Options) -> None:
-    """The chunks that are not finished, by workers; what comes of them is written here."""
+    """The chunks that are not finished, the largest first, by workers; what comes of them is written here."""
     todo = unfinished_chunks(current, o)
     if not todo:
         return
     maker = ChunkWorker(program=current.settings["program"], options=dataclasses.asdict(o))
-    team: Team = LocalTeam(maker, o.workers) if o.ray is None else RayTeam(maker, o.ray, o.workers)
+    todo = largest_first(todo, lambda names: [file for n in names for file in current.data.files(n)])
     failed = 0
     with progress_bar() as bar:
         task = bar.add_task(current.settings["program"], total=sum(map(len, todo)))
-        for outcome in work_through(todo, team):
+        for outcome in work_through(todo, team_of(maker, o)):
             bar.advance(task, len(outcome.task))
             if outcome.answer.error:
                 failed += len(outcome.task)

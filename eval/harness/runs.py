@@ -31,10 +31,10 @@ from eval.data.truth import Benchmark, KnownScene
 from eval.harness.extra import library
 from eval.harness.options import Options, benchmark, told_upright
 from eval.harness.run_folder import RunFolder, claim, write_json
-from eval.harness.shards import shard_of
 from eval.scores.figures import Record
 from more2_jax.config import SceneConfig, preset
 from more2_jax.network.prior import Prior, load_prior
+from more2_jax.workers.shares import shard_of
 
 VERSION = 1
 PEER_LIBRARIES = ("open3d", "small_gicp")  # that peers of all programs are made of

@@ -1,4 +1,4 @@
-"""Shares of a run that know nothing of one another: `--shard 2/8` is the second of eight, whoever computes the others.
+"""What a shard of a run (`--shard 2/8`: the second of eight) leaves for merging.
 
 Shares are dealt in chunks, not in scenes: scenes of a chunk are encoded in one batch, and a batch of other scenes may
 round otherwise. So shards, a run that was stopped, and one process all compute the same batches.
@@ -8,40 +8,16 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import re
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from eval.harness.options import Options
 from eval.harness.run_folder import RunFolder, write_json
+from more2_jax.workers.shares import shard_of
 
-ELSEWHERE = ("data", "out", "shard", "workers", "ray", "fresh")  # options that change no result
-
-
-@dataclass(frozen=True, kw_only=True)
-class Shard:
-    """One of `count` shares, from 1."""
-
-    number: int = 1
-    count: int = 1
-
-    def __str__(self) -> str:
-        return f"{self.number}/{self.count}"
-
-    def of(self, chunks: Sequence[Sequence[str]]) -> list[Sequence[str]]:
-        """Every `count`-th chunk, from the `number`-th."""
-        return list(chunks[self.number - 1 :: self.count])
-
-
-def shard_of(text: str) -> Shard:
-    """The shard that `i/n` names. Raises ValueError for what is none."""
-    found = re.fullmatch(r"(\d+)/(\d+)", text)
-    number, count = (int(found[1]), int(found[2])) if found else (0, 0)
-    if not 1 <= number <= count:
-        raise ValueError(f"--shard {text}; needed i/n with 1 ≤ i ≤ n, such as 2/8")
-    return Shard(number=number, count=count)
+# Options that change no result.
+ELSEWHERE = ("data", "out", "shard", "workers", "ray", "scene_minutes", "fresh")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import json
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -15,9 +15,12 @@ from more2_jax.cli.manifest import RottenRow, SceneJob, read_manifest
 from more2_jax.cli.options import Reporting
 from more2_jax.cli.session import Session, keep_compiled_programs
 from more2_jax.cli.tables import write_table
+from more2_jax.whole_file import check_writable
 from more2_jax.workers.dealing import Handler, Team, work_through
+from more2_jax.workers.largest_first import largest_first
 from more2_jax.workers.local import LocalTeam
 from more2_jax.workers.ray_cluster import RayTeam
+from more2_jax.workers.time_limit import limit_of
 
 RESULTS = "results"  # beside the scenes
 COLUMNS: dict[str, type] = {
@@ -40,19 +43,42 @@ DAMAGE = (OSError, ValueError, KeyError, TypeError)
 
 
 def run_batch(
-    manifest: Path, out: Path, *, workers: int | None = None, ray: str | None = None, quiet: bool = False
+    manifest: Path,
+    out: Path,
+    *,
+    workers: int | None = None,
+    ray: str | None = None,
+    scene_minutes: float | None = None,
+    quiet: bool = False,
 ) -> int:
     """Builds the scenes that are not finished; returns 1 if any row failed, else 0.
 
     A row that fails says so in one line on standard error and costs no other. `workers`: processes, one by default;
-    with `ray`, actors: by default as many as the cluster at that address has room for. Raises ValueError if the
-    manifest cannot be read.
+    with `ray`, actors: by default as many as the cluster at that address has room for. A process that takes longer
+    than `scene_minutes` for a scene is ended, and the scene tried once more. The largest scenes begin first. Raises
+    ValueError if the manifest cannot be read.
     """
+    limit_s = limit_of(scene_minutes)
     if workers is not None and workers < 1:
         raise ValueError(f"--workers {workers}; needed 1 or more")
     rows = read_manifest(manifest, out)
+    check_writable(out / RESULTS)
     out.mkdir(parents=True, exist_ok=True)
     results = Results(session=Session(Reporting(quiet=quiet)), count=len(rows))
+    todo = unfinished(rows, results)
+    try:
+        for outcome in work_through(todo, team_of(workers, ray, len(todo), limit_s)) if todo else ():
+            if outcome.answer.error:
+                results.failed(outcome.task, outcome.answer.error)
+            else:
+                results.finished(outcome.task, "done")
+    finally:
+        path = write_table(out / RESULTS, COLUMNS, [results.rows[k] for k in sorted(results.rows)])
+    return results.summed_up(path)
+
+
+def unfinished(rows: Sequence[SceneJob | RottenRow], results: Results) -> list[SceneJob]:
+    """The scenes that are left to build, the largest first; what the other rows came to is noted."""
     todo: list[SceneJob] = []
     for row in rows:
         if isinstance(row, RottenRow):
@@ -61,15 +87,7 @@ def run_batch(
             results.finished(row, "kept")
         else:
             todo.append(row)
-    try:
-        for outcome in work_through(todo, team_of(workers, ray, len(todo))) if todo else ():
-            if outcome.answer.error:
-                results.failed(outcome.task, outcome.answer.error)
-            else:
-                results.finished(outcome.task, "done")
-    finally:
-        path = write_table(out / RESULTS, COLUMNS, [results.rows[k] for k in sorted(results.rows)])
-    return results.summed_up(path)
+    return largest_first(todo, lambda job: job.scans)
 
 
 @dataclass
@@ -105,12 +123,12 @@ class Results:
         return 1 if failed else 0
 
 
-def team_of(workers: int | None, ray: str | None, tasks: int) -> Team:
-    """Local processes, or actors of a cluster; no more than there are tasks."""
+def team_of(workers: int | None, ray: str | None, tasks: int, limit_s: float | None) -> Team:
+    """Local processes, or actors of a cluster; no more than there are tasks. `limit_s`: seconds a task may take."""
     maker = SceneMaker()
     if ray is not None:
-        return RayTeam(maker, ray, min(workers or tasks, tasks))
-    return LocalTeam(maker, min(workers or 1, tasks))
+        return RayTeam(maker, ray, min(workers or tasks, tasks), limit_s)
+    return LocalTeam(maker, min(workers or 1, tasks), limit_s)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -121,11 +121,20 @@ class Batch:
     """Processes that stay alive over scenes: 1; with --ray, as many actors as the cluster has room for."""
     ray: str | None = None
     """Address of a Ray cluster whose actors do the work ("local" starts one here); all see the same folders."""
+    scene_minutes: float | None = None
+    """A process that takes longer for a scene is ended; the scene is tried once more, then fails. None: any time."""
     quiet: bool = False
     """Print warnings and errors only."""
 
     def __call__(self) -> int:
-        return batch.run_batch(self.manifest, self.out, workers=self.workers, ray=self.ray, quiet=self.quiet)
+        return batch.run_batch(
+            self.manifest,
+            self.out,
+            workers=self.workers,
+            ray=self.ray,
+            scene_minutes=self.scene_minutes,
+            quiet=self.quiet,
+        )
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from more2_jax.export.poses import write_poses
 from more2_jax.export.usd import write_usd
 from more2_jax.storage.scene_folder import WRITTEN
 from more2_jax.types import LivingScene
-from more2_jax.whole_file import whole_file
+from more2_jax.whole_file import check_writable, whole_file
 
 __all__ = ["SUFFIXES", "export_scene", "pose_in"]
 
@@ -43,8 +43,8 @@ def export_scene(scene: LivingScene, target: str | Path, format: str, *, scan: i
     `<id>_not_seen`, and say so a scan (glb: `extras.states`; usd: the attribute `more2:state`: `seen`, `not_seen` or
     `absent`); ply names its number in a comment; json has `scans[].not_seen` and `changes[].not_seen`.
 
-    Raises ValueError for an unknown format or scan, a scan without objects (glb, ply), USD without its extra, or
-    a path that would overwrite part of a living scene.
+    Raises ValueError for an unknown format or scan, a scan without objects (glb, ply), USD without its extra, a
+    folder that cannot be written, or a path that would overwrite part of a living scene.
     """
     if format not in WRITERS:
         raise ValueError(f"format {format!r}; needed one of {', '.join(WRITERS)}")
@@ -56,6 +56,7 @@ def export_scene(scene: LivingScene, target: str | Path, format: str, *, scan: i
     path = target / f"export{SUFFIXES[format]}" if target.is_dir() else target
     if path.name in WRITTEN and (path.parent / "scene.json").exists():
         raise ValueError(f"{path}: part of a living scene; needed another file")
+    check_writable(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     with whole_file(path) as partial:
         WRITERS[format](scene, partial, scan % len(scene.scans))

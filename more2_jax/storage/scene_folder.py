@@ -39,6 +39,7 @@ from more2_jax.types import (
     SceneObject,
     Skipped,
 )
+from more2_jax.whole_file import check_writable
 
 PAGE = "report.html"
 WRITTEN = (
@@ -86,9 +87,7 @@ def check_output(folder: str | Path) -> None:
         raise ValueError(f"{folder}: a mount point cannot be replaced; needed a folder inside it")
     if folder.is_dir() and any(folder.iterdir()) and not _is_scene(folder):
         raise ValueError(f"{folder}: output folder not empty and not a living scene; needed a new folder")
-    parent = next(p for p in folder.parents if p.exists())
-    if not parent.is_dir() or not os.access(parent, os.W_OK):
-        raise ValueError(f"{folder}: cannot write in {parent}; needed a folder that can be written")
+    check_writable(folder)
 
 
 def _beside(folder: Path, kind: str) -> Path:

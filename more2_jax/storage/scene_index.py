@@ -16,7 +16,7 @@ from jaxtyping import Float
 
 from more2_jax.storage.scene_folder import DAMAGE, load_scene
 from more2_jax.types import LivingScene, SceneObject
-from more2_jax.whole_file import whole_file
+from more2_jax.whole_file import check_writable, whole_file
 
 VERSION = 1
 SIZE_WEIGHT = 0.5  # of |log| of the ratio of the F_s, as `EvidenceMatcher.size_weight`
@@ -120,7 +120,8 @@ def index_folders(folders: Iterable[Path]) -> SceneIndex:
 
 
 def save_index(index: SceneIndex, path: Path) -> None:
-    """Writes it, whole or not at all."""
+    """Writes it, whole or not at all. Raises ValueError where its folder cannot be written."""
+    check_writable(path)
     with whole_file(path) as partial, partial.open("wb") as file:
         np.savez_compressed(file, version=np.array(VERSION), **vars(index))
 

@@ -53,7 +53,7 @@ class Team(Protocol):
         ...
 
     def wait(self) -> list[tuple[Hashable, Answer | Lost]]:
-        """Waits for at least one of the workers that have a task."""
+        """Waits for some of the workers that have a task; what is heard may be nothing yet."""
         ...
 
     def dismiss(self, worker: Any) -> None:

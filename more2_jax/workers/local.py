@@ -14,19 +14,32 @@ from multiprocessing.process import BaseProcess
 from typing import Any
 
 from more2_jax.workers.dealing import Answer, Desk, Lost, Maker
+from more2_jax.workers.time_limit import TimeLimit
 
 ENDING_S = 10.0  # for a process that was asked to end, or whose pipe broke
 
 
+@dataclass(frozen=True)
+class Begun:
+    """What a worker says when it has taken a task: it has started, and its time counts from here."""
+
+
 @dataclass
 class LocalTeam:
-    """So many processes at most; spawned, not forked: a fork after JAX has started threads may hang."""
+    """So many processes at most; spawned, not forked: a fork after JAX has started threads may hang.
+
+    A worker that takes longer than `limit_s` seconds for a task is killed, and lost.
+    """
 
     maker: Maker
     size: int
+    limit_s: float | None = None
     _workers: dict[int, tuple[BaseProcess, Any]] = field(default_factory=dict)
     _busy: set[int] = field(default_factory=set)
     _started: int = 0
+
+    def __post_init__(self) -> None:
+        self._limit = TimeLimit(self.limit_s)
 
     def start(self) -> Hashable:
         """A new process."""
@@ -46,17 +59,31 @@ class LocalTeam:
             self._workers[worker][1].send(task)
 
     def wait(self) -> list[tuple[Hashable, Answer | Lost]]:
-        """Waits for at least one of the workers that have a task."""
+        """Waits for some of the workers that have a task, or until one is over the limit."""
         ends = {self._workers[w][1]: w for w in self._busy}
         heard: list[tuple[Hashable, Answer | Lost]] = []
-        for end in wait(list(ends)):
+        for end in wait(list(ends), self._limit.left_s()):
             worker = ends[end]  # pyright: ignore[reportArgumentType]
-            self._busy.discard(worker)
             try:
-                heard.append((worker, self._workers[worker][1].recv()))
+                said = self._workers[worker][1].recv()
             except (EOFError, ConnectionResetError):
-                heard.append((worker, Lost(reason=self._end_of(worker))))
-        return heard
+                said = Lost(reason=self._end_of(worker))
+            if isinstance(said, Begun):
+                self._limit.begin(worker)
+            else:
+                self._limit.end(worker)
+                self._busy.discard(worker)
+                heard.append((worker, said))
+        return [*heard, *self._end_late()]
+
+    def _end_late(self) -> list[tuple[Hashable, Answer | Lost]]:
+        late = self._limit.over()
+        for worker in late:
+            self._limit.end(worker)
+            self._busy.discard(worker)  # pyright: ignore[reportArgumentType]
+            self._workers[worker][0].kill()  # pyright: ignore[reportArgumentType]
+            self._end_of(worker)  # pyright: ignore[reportArgumentType]
+        return [(worker, self._limit.loss()) for worker in late]
 
     def _end_of(self, worker: int) -> str:
         process, connection = self._workers.pop(worker)
@@ -90,7 +117,9 @@ def serve(connection: Connection, maker: Maker) -> None:
     desk = Desk(maker)
     with contextlib.suppress(EOFError, ConnectionResetError, BrokenPipeError):
         while True:
-            connection.send(desk.answer(connection.recv()))
+            task = connection.recv()
+            connection.send(Begun())
+            connection.send(desk.answer(task))
 
 
 def _end_with_parent() -> None:

@@ -9,14 +9,19 @@ from collections.abc import Hashable
 from typing import Any
 
 from more2_jax.workers.dealing import Answer, Desk, Lost, Maker
+from more2_jax.workers.time_limit import TimeLimit
 
 ANSWER_S = 10.0  # for a cluster to answer at all
 
 
 class RayTeam:
-    """At most so many actors, and no more than the cluster has room for; 0 for as many as it has room for."""
+    """At most so many actors, and no more than the cluster has room for; 0 for as many as it has room for.
 
-    def __init__(self, maker: Maker, address: str, size: int = 0) -> None:
+    An actor that takes longer than `limit_s` seconds for a task is killed, and lost. Its time counts from when it is
+    up: where the cluster has no room, it waits as long as it takes.
+    """
+
+    def __init__(self, maker: Maker, address: str, size: int = 0, limit_s: float | None = None) -> None:
         """`address`: of a running cluster; "local" starts one here. Raises ValueError where there is none."""
         self.ray = connect(address)
         has = self.ray.cluster_resources()
@@ -27,26 +32,51 @@ class RayTeam:
         self.actor = self.ray.remote(Desk).options(**needs, scheduling_strategy="SPREAD")
         self.maker = maker
         self.having: dict[Any, Hashable] = {}  # the reference of an answer to come → who gives it
+        self.rising: dict[Any, Hashable] = {}  # the reference that tells that an actor is up → the actor
+        self.limit = TimeLimit(limit_s)
 
     def start(self) -> Hashable:
         """A new actor; where the cluster has no room it waits for some."""
-        return self.actor.remote(self.maker)
+        worker = self.actor.remote(self.maker)
+        if self.limit.seconds is not None:
+            self.rising[worker.__ray_ready__.remote()] = worker
+        return worker
 
     def give(self, worker: Any, task: Any) -> None:
         """A task for an actor that has none."""
         self.having[worker.answer.remote(task)] = worker
+        if worker not in self.rising.values():
+            self.limit.begin(worker)
 
     def wait(self) -> list[tuple[Hashable, Answer | Lost]]:
-        """Waits for at least one of the actors that have a task."""
-        ready, _ = self.ray.wait(list(self.having), num_returns=1)
+        """Waits for some of the actors that have a task, or until one is over the limit."""
+        references = [*self.having, *self.rising]
+        ready, _ = self.ray.wait(references, num_returns=1, timeout=self.limit.left_s())
         heard: list[tuple[Hashable, Answer | Lost]] = []
         for reference in ready:
+            if reference in self.rising:
+                self.limit.begin(self.rising.pop(reference))
+                continue
             worker = self.having.pop(reference)
             try:
                 heard.append((worker, self.ray.get(reference)))
             except self.ray.exceptions.RayError as error:  # the actor, its node, or what it held
                 heard.append((worker, Lost(reason=type(error).__name__)))
-        return heard
+            self._forget(worker)
+        return [*heard, *self._end_late()]
+
+    def _end_late(self) -> list[tuple[Hashable, Answer | Lost]]:
+        late = self.limit.over()
+        for worker in late:
+            self.having = {r: w for r, w in self.having.items() if w != worker}
+            self._forget(worker)
+            self.ray.kill(worker)
+        return [(worker, self.limit.loss()) for worker in late]
+
+    def _forget(self, worker: Hashable) -> None:
+        """Its task is done, or it is gone: no time runs for it."""
+        self.limit.end(worker)
+        self.rising = {r: w for r, w in self.rising.items() if w != worker}
 
     def dismiss(self, worker: Any) -> None:
         """Ends an actor that has no task."""

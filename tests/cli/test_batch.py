@@ -10,8 +10,9 @@ import psutil
 import pytest
 from command_line import FEW_STEPS, boxes, refused, run_quickly, scan_file
 from inline_team import Inline
+from stages_by_mask import stages_by_mask
 
-from more2_jax import scene
+from more2_jax import report, scene
 from more2_jax.cli import batch
 from more2_jax.cli.main import main
 from more2_jax.cli.manifest import RottenRow, SceneJob, read_manifest
@@ -91,6 +92,41 @@ def test_each_scene_is_what_run_makes_of_it_and_a_rotten_row_costs_itself(place,
     assert run_quickly(place / "a.ply", place / "b.ply", out=place / "plain", prior=tiny) == 0
     assert told_of(out / "one") == told_of(place / "plain")
     assert sorted(p.name for p in out.iterdir()) == ["alone", "one", "results.csv"]
+
+
+def test_one_rotten_row_in_a_hundred(place, tiny, inline, capsys, monkeypatch):
+    """99 scenes are there and one line is said; the next call tries the one alone, and with its scan mended all are."""
+    monkeypatch.setattr(report, "report_html", lambda *_: "")  # takes a third of the time
+    out, names = place / "all", [f"room_{k:02d}" for k in range(100)]
+    rows = [f"{n},{'cut.ply' if n == 'room_42' else 'a.ply'},{tiny}" for n in names]
+    path = written(place, tiny, *rows, columns="name,scans,prior")
+    whole = (place / "a.ply").read_bytes()
+    (place / "cut.ply").write_bytes(whole[: len(whole) // 2])
+    with stages_by_mask():
+        assert go(path, out) == 1
+        told = capsys.readouterr()
+        (line,) = told.err.splitlines()
+        assert line.startswith("error: row 43 (room_42): ") and "cut.ply" in line
+        assert "99 scenes done, 0 were finished before, 1 failed" in told.out
+        scenes = {p.parent.name: p.stat().st_mtime_ns for p in out.glob("*/scene.json")}
+        assert sorted(scenes) == [n for n in names if n != "room_42"]
+        assert [r["name"] for r in results(out) if r["status"] == "failed"] == ["room_42"]
+        assert go(path, out) == 1
+        assert inline[-1].tasks == ["room_42"] and capsys.readouterr().err == told.err
+        (place / "cut.ply").write_bytes(whole)
+        assert go(path, out) == 0
+    assert [r["status"] for r in results(out)] == ["done" if n == "room_42" else "kept" for n in names]
+    assert {n: (out / n / "scene.json").stat().st_mtime_ns for n in scenes} == scenes
+    assert sorted(p.name for p in out.iterdir()) == ["results.csv", *names]
+
+
+def test_the_largest_scene_begins_first_and_the_results_are_in_the_order_of_the_rows(place, tiny, inline):
+    scan_file(place / "large.ply", *boxes(count=3))
+    rows = ["small,a.ply", "two,a.ply;b.ply", "large,a.ply;large.ply", "also small,b.ply"]
+    with stages_by_mask():
+        assert go(written(place, tiny, *rows), place / "all") == 0
+    assert inline[-1].tasks == ["large", "two", "small", "also small"]
+    assert [r["name"] for r in results(place / "all")] == ["small", "two", "large", "also small"]
 
 
 def told_of(folder):
@@ -211,9 +247,9 @@ def test_a_file_that_is_no_manifest_is_one_line(place, capsys, text, says):
     assert not (place / "all").exists()
     assert "No such file" in refused(capsys, "batch", place / "gone.csv", "--out", place / "all")
     assert "Parquet needs pyarrow" in refused(capsys, "batch", place / "gone.parquet", "--out", place / "all")
-    assert "--workers 0; needed 1 or more" in refused(
-        capsys, "batch", path, "--out", place / "all", "--workers", 0
-    )
+    for option, says in (("--workers", "1 or more"), ("--scene-minutes", "more than 0")):
+        said = refused(capsys, "batch", path, "--out", place / "all", option, 0)
+        assert f"{option} 0; needed {says}" in said
 
 
 @pytest.mark.slow

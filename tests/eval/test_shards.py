@@ -2,21 +2,25 @@
 
 import dataclasses
 import json
+import shutil
 import sys
 from types import ModuleType
 
 import numpy as np
 import pytest
+from inline_team import Inline
+from known_scenes import known_scene
 from published_folder import write_published
 
 from eval import matching, merge
+from eval.harness import program
 from eval.harness.options import Options
 from eval.harness.program import Program, Summary, carry_out
 from eval.harness.run_folder import RunFolder
 from eval.harness.runs import open_run, unfinished_chunks
-from eval.harness.shards import shard_of
 from eval.scores.figures import Figure
 from more2_jax.network.prior import save_prior
+from more2_jax.workers.shares import shard_of
 
 NAMES = [f"scene_{k}" for k in range(7)]
 DATED = ("date",)  # of results.json: when, not what
@@ -94,6 +98,21 @@ def test_merged_shards_are_one_run_to_the_bit(options, drawn, count, together, t
     before = (options.out / "results.json").read_bytes()
     merge.main(tuple(dict.fromkeys(o.out for o in parts)), options.out)  # again, over itself
     assert (options.out / "results.json").read_bytes() == before
+
+
+def test_workers_begin_with_the_largest_chunk_which_changes_no_result(options, drawn, monkeypatch, tmp_path):
+    shutil.rmtree(options.data / NAMES[4])
+    write_published(options.data / NAMES[4], known_scene(points=512))
+    carry_out(drawn.PROGRAM, options)
+    teams = []
+    monkeypatch.setattr(program, "team_of", lambda maker, o: teams.append(Inline(maker)) or teams[-1])
+    elsewhere = dataclasses.replace(options, out=tmp_path / "elsewhere", workers=1, scene_minutes=5.0)
+    carry_out(drawn.PROGRAM, elsewhere)
+    assert [*map(list, teams[0].tasks)] == [NAMES[4:6], NAMES[:2], NAMES[2:4], NAMES[6:]]
+    here, there = (json.loads((o.out / "results.json").read_text()) for o in (options, elsewhere))
+    assert there["rows"] == here["rows"]
+    with pytest.raises(ValueError, match="--scene-minutes 5; needed --workers or --ray"):
+        carry_out(drawn.PROGRAM, dataclasses.replace(elsewhere, workers=0))
 
 
 def test_merging_needs_neither_data_nor_weights(options, drawn, tmp_path):

@@ -1,4 +1,4 @@
-"""A team of `more2 batch` that works in this process, where programs are compiled already."""
+"""A team that works in this process, where programs are compiled already; by default that of `more2 batch`."""
 
 from collections import deque
 
@@ -11,15 +11,15 @@ class Inline:
 
     size = 1
 
-    def __init__(self):
-        self.desk, self.having, self.tasks = Desk(batch.SceneMaker()), deque(), []
+    def __init__(self, maker=None):
+        self.desk, self.having, self.tasks = Desk(maker or batch.SceneMaker()), deque(), []
 
     def start(self):
         return 1
 
     def give(self, worker, task):
         self.having.append(task)
-        self.tasks.append(task.name)
+        self.tasks.append(getattr(task, "name", task))
 
     def wait(self):
         return [(1, self.desk.answer(self.having.popleft()))]

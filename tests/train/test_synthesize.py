@@ -4,6 +4,7 @@ import dataclasses
 import json
 import shutil
 import sys
+from functools import partial
 from itertools import combinations, pairwise
 from pathlib import Path
 from unittest.mock import patch
@@ -71,9 +72,7 @@ def make(job: synthesize.Job, folder: Path, regime: str, *, free: bool = False, 
         job, out=folder / f"{regime}{free}", regime=synthesize._regime(regime), free=free, scans=4
     )
     synthesize.claim(one)
-    synthesize._start(one)
-    synthesize._usable.cache_clear()
-    synthesize.make_scene(number)
+    synthesize.make_scene(one, number)
     return one.out / f"scene_{number:04d}"
 
 
@@ -244,6 +243,74 @@ def test_any_number_of_workers_gives_the_same_and_a_stopped_run_resumes(command,
     assert "License: CC0" in (tmp_path / "one" / "LICENSES.md").read_text()
     code, said = command(tmp_path / "one", "--seed", "1")
     assert (code, said.count("\n")) == (2, 1)
+
+
+class Alone:
+    """Workers that are this process."""
+
+    def __init__(self, processes=0, ray=None, shared=None):
+        self.shared = shared
+
+    def map(self, function, items):
+        return map(function, items)
+
+    def map_shared(self, function, items):
+        return map(partial(function, self.shared), items)
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        pass
+
+
+def same_files(one: Path, other: Path) -> bool:
+    """Every file below, to the byte."""
+    files = [{p.relative_to(f): p.read_bytes() for p in f.rglob("*") if p.is_file()} for f in (one, other)]
+    return files[0] == files[1] and len(files[0]) > 0
+
+
+def test_shards_make_the_scenes_of_one_process_and_the_last_writes_the_index(
+    command, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.setattr(synthesize, "Workers", Alone)
+    assert command(tmp_path / "whole")[0] == 0
+    shared = tmp_path / "shared"
+    shared.mkdir()
+    shutil.copytree(tmp_path / "whole/models", shared / "models")
+    assert command(shared, "--shard", "2/2")[0] == 0
+    assert {p.name for p in shared.iterdir()} == {"models", "scene_0001", "settings.json", "report.json"}
+    assert command(shared, "--shard", "1/2")[0] == 0
+    assert same_files(shared, tmp_path / "whole")
+    before = (shared / "index.json").read_bytes()
+    (shared / "index.json").unlink()
+    assert command(shared)[0] == 0  # without a shard, as where two ended at once
+    assert (shared / "index.json").read_bytes() == before
+    code, said = command(shared, "--shard", "3/2")
+    assert (code, said) == (2, "error: --shard 3/2; needed i/n with 1 ≤ i ≤ n, such as 2/8\n")
+
+
+@pytest.mark.slow
+def test_a_cluster_makes_the_same_bytes(source, tmp_path):
+    """Two nodes of a Ray cluster on this machine against one process; what fails there is one line, too."""
+    pytest.importorskip("ray", reason="the cluster extra is not installed")
+    from ray.cluster_utils import Cluster
+
+    def settings(folder: str, **more) -> synthesize.Settings:
+        given = {"source": source, "regime": "changes", "out": tmp_path / folder, "scenes": 3, "scans": 3}
+        return synthesize.Settings(**(given | more))
+
+    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False})
+    cluster.add_node(num_cpus=1)
+    try:
+        synthesize.main(settings("ray", ray=cluster.address))
+        with pytest.raises(ValueError, match="needed more room") as raised:
+            synthesize.main(settings("small", ray=cluster.address, room_m=(1.0, 1.0)))
+    finally:
+        cluster.shutdown()
+    assert "\n" not in str(raised.value)
+    synthesize.main(settings("alone", workers=1))
+    assert same_files(tmp_path / "ray", tmp_path / "alone")
 
 
 def test_bad_input_is_one_line(source, tmp_path):

@@ -47,6 +47,27 @@ def test_workers_stay_alive_over_tasks_and_no_more_are_started(tmp_path):
     assert outcomes(few, [], 3) == []
 
 
+LATE = [0, "sleeps", 1, "sleeps once", 2]
+
+
+def held_to_the_limit(found, folder):
+    """What takes too long is ended and tried once more; who is in time is left alone."""
+    assert sorted(map(str, (o.task for o in found))) == sorted(map(str, LATE))  # each once
+    told = {o.task: o for o in found}
+    assert {n: (told[n].answer.value[0], told[n].tries) for n in range(3)} == {
+        n: (n * n, 1) for n in range(3)
+    }
+    assert told["sleeps"].answer.error == "its process ended 2 times (not done within 0.025 minutes)"
+    assert (told["sleeps once"].answer.value[0], told["sleeps once"].tries) == ("sleeps once", 2)
+    assert len(list(folder.glob("task_sleeps_*"))) == 2
+
+
+def test_a_worker_over_the_limit_is_ended_and_its_task_tried_once_more(tmp_path):
+    held_to_the_limit(list(work_through(LATE, LocalTeam(Square(tmp_path), 2, limit_s=1.5))), tmp_path)
+    left = psutil.Process().children(recursive=True)
+    assert not [p for p in left if "spawn_main" in " ".join(p.cmdline())]
+
+
 def test_workers_end_with_a_caller_that_stops_listening(tmp_path):
     for _ in work_through([1, "sleeps", "sleeps"], LocalTeam(Square(tmp_path), 2)):
         break
@@ -132,6 +153,15 @@ def test_actors_of_a_cluster_do_the_same(tmp_path, monkeypatch):
     assert (told["dies once"].answer.value[0], told["dies once"].tries) == ("dies once", 2)
     assert "its process ended 2 times (ActorDiedError)" in told["dies"].answer.error
     assert len(list(tmp_path.glob("made_*"))) <= 2 + 5  # as many as died, and no more
+
+
+@pytest.mark.slow
+def test_an_actor_over_the_limit_is_ended_and_its_task_tried_once_more(tmp_path, monkeypatch):
+    pytest.importorskip("ray")
+    from more2_jax.workers.ray_cluster import RayTeam
+
+    monkeypatch.setenv("PYTHONPATH", f"{ROOT}:{ROOT / 'tests/support'}")  # for the actors
+    held_to_the_limit(list(work_through(LATE, RayTeam(Square(tmp_path), "local", 2, limit_s=1.5))), tmp_path)
 
 
 def test_no_cluster_is_one_line():

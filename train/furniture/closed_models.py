@@ -104,7 +104,7 @@ def make_cached(mesh: SourceMesh, cache: Path) -> str | None:
     try:
         model, symmetry = closed_model(mesh)
     except ValueError as error:
-        _atomically(reasons, json.dumps({"reason": str(error)}).encode())
+        atomically(reasons, json.dumps({"reason": str(error)}).encode())
         return str(error)
     partial = target.with_suffix(f".{uuid4().hex}.partial.npz")
     np.savez(partial, vertices=model.vertices, faces=model.faces.astype(np.int32), symmetry=symmetry)
@@ -112,7 +112,8 @@ def make_cached(mesh: SourceMesh, cache: Path) -> str | None:
     return None
 
 
-def _atomically(path: Path, content: bytes) -> None:
+def atomically(path: Path, content: bytes) -> None:
+    """Writes the file whole or not at all; any number of processes may at a time, and the last one stays."""
     partial = path.with_suffix(f".{uuid4().hex}.partial")
     partial.write_bytes(content)
     partial.replace(path)
