@@ -199,6 +199,16 @@ def test_matching_is_by_the_nearest_code(with_tiny):
     assert methods.by_code(with_tiny, one, []) == {}
 
 
+def test_vn_onet_matches_turned_and_grown_copies_and_conv_onet_matches_nothing():
+    rng, R = np.random.default_rng(0), pose(130, [0, 0, 0])[:3, :3]
+    one = [Instance(id=k, points=rng.normal(size=(80, 3)) * [1, 0.6, 0.2 + k]) for k in range(3)]
+    other = [Instance(id=10 + i.id, points=2 * i.points @ R.T + 5) for i in one][::-1]
+    ((title, match),) = methods.learned_matchers(("vn_onet",)).items()
+    assert title == "VN-ONet, small" and match(one, other) == {0: 10, 1: 11, 2: 12}
+    with pytest.raises(ValueError, match="ConvONet, small is of reconstruction; needed a peer of matching"):
+        methods.learned_matchers(("conv_onet",))
+
+
 def legged(count, seed):
     """A table without symmetry: a top, one leg, and a box on it."""
     parts = [

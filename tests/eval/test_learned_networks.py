@@ -39,8 +39,19 @@ def dgcnn():
 
 
 @pytest.fixture(scope="module")
-def onet():
-    return jax.jit(with_weights(VNONet(SMALL), CLOUD, REAL, QUERIES))
+def onet_and_code():
+    apply = with_weights(VNONet(SMALL), CLOUD, REAL, QUERIES)
+    return jax.jit(lambda c, m, q: (apply(c, m, q), apply(c, m, method="unit_code")))
+
+
+@pytest.fixture(scope="module")
+def onet(onet_and_code):
+    return lambda *given: onet_and_code(*given)[0]
+
+
+@pytest.fixture(scope="module")
+def onet_code(onet_and_code):
+    return lambda *given: onet_and_code(*given, QUERIES)[1]
 
 
 @pytest.fixture(scope="module")
@@ -55,12 +66,14 @@ def rpm():
 
 
 @pytest.mark.optimized
-def test_the_code_of_a_cloud_does_not_change_when_it_turns_moves_and_grows(dgcnn):
-    here, there = dgcnn(CLOUD, REAL), dgcnn(moved(CLOUD), REAL)
+@pytest.mark.parametrize("name", ["dgcnn", "onet_code"])
+def test_the_code_of_a_cloud_does_not_change_when_it_turns_moves_and_grows(name, request):
+    code = request.getfixturevalue(name)
+    here, there = code(CLOUD, REAL), code(moved(CLOUD), REAL)
     np.testing.assert_allclose(there, here, atol=1e-4)
     assert np.linalg.norm(here) == pytest.approx(1, abs=1e-5)
     other = CLOUD * np.array([1, 1, 0.1], np.float32)
-    assert np.abs(dgcnn(other, REAL) - here).max() > 1e-2
+    assert np.abs(code(other, REAL) - here).max() > 1e-2
 
 
 @pytest.mark.optimized
@@ -77,10 +90,10 @@ def test_occupancy_of_planes_moves_and_grows_with_the_cloud_but_does_not_turn(pl
     assert np.abs(planes(moved(CLOUD), REAL, moved(QUERIES)) - here).max() > 1e-3
 
 
-@pytest.mark.parametrize("name", ["dgcnn", "onet", "planes"])
+@pytest.mark.parametrize("name", ["dgcnn", "onet", "onet_code", "planes"])
 def test_padding_changes_nothing(name, request):
     network = request.getfixturevalue(name)
-    rest = () if name == "dgcnn" else (QUERIES,)
+    rest = () if name in ("dgcnn", "onet_code") else (QUERIES,)
     nonsense = np.where(REAL[:, None], CLOUD, 1e6).astype(np.float32)
     np.testing.assert_allclose(network(nonsense, REAL, *rest), network(CLOUD, REAL, *rest), atol=1e-6)
 

@@ -43,7 +43,7 @@ def learned_registrars(given: tuple[str, ...]) -> dict[str, Registrar]:
 
 
 def learned_stages(given: tuple[str, ...], upright: bool) -> dict[str, Stages]:
-    """The whole task by one peer a stage, as MendNet combines them; none where none is asked for.
+    """The whole task by one peer a stage, each at what it is trained for; none where none is asked for.
 
     Raises ValueError as `load`, and unless there is one of each stage.
     """
@@ -67,7 +67,8 @@ def learned_stages(given: tuple[str, ...], upright: bool) -> dict[str, Stages]:
 def _codes(
     network: nn.Module, params: Params, points: Float[Array, "1 n 3"], mask: Bool[Array, "1 n"]
 ) -> Float[Array, "1 code"]:
-    return jax.vmap(partial(network.apply, params))(points, mask)  # type: ignore[arg-type]
+    of_cloud = partial(network.apply, params, method="unit_code")
+    return jax.vmap(of_cloud)(points, mask)  # type: ignore[arg-type]
 
 
 def codes(trained: Trained, clouds: Sequence[Points]) -> Float[np.ndarray, "b code"]:

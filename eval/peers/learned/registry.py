@@ -40,12 +40,18 @@ class LearnedPeer:
     """One network, and how it is trained."""
 
     title: str  # in tables
-    task: Task
+    task: Task  # that it is trained for
     network: nn.Module
     loss: Loss
     points: int  # of a cloud
     batch: int  # shapes a step, two partial clouds each
     learning_rate: float = 1e-3
+    also: tuple[Task, ...] = ()  # tables that its network serves without being trained for them
+
+    @property
+    def tasks(self) -> tuple[Task, ...]:
+        """All tables that it may stand in."""
+        return (self.task, *self.also)
 
 
 PEERS: Mapping[str, LearnedPeer] = {
@@ -64,6 +70,7 @@ PEERS: Mapping[str, LearnedPeer] = {
         loss=occupancy_loss,
         points=256,
         batch=8,
+        also=("matching",),
     ),
     "conv_onet": LearnedPeer(
         title="ConvONet, small",
@@ -178,11 +185,12 @@ def _check(peer: LearnedPeer, name: str, params: Params, path: Path) -> None:
 
 
 def of_task(given: tuple[str, ...], task: Task) -> list[Trained]:
-    """The peers that were asked for. Raises ValueError as `load`, and if one does something else than `task`."""
+    """The peers that were asked for. Raises ValueError as `load`, and if one does not do `task`."""
     found = [load(g) for g in given]
     for one in found:
-        if one.peer.task != task:
-            raise ValueError(f"{one.peer.title} is of {one.peer.task}; needed a peer of {task}")
+        if task not in one.peer.tasks:
+            does = " and ".join(one.peer.tasks)
+            raise ValueError(f"{one.peer.title} is of {does}; needed a peer of {task}")
     return found
 
 

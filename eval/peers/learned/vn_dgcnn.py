@@ -79,6 +79,10 @@ class VNDGCNN(nn.Module):
         x = nn.Dense(CODE)(x)
         return x / jnp.sqrt(jnp.sum(x * x) + 1e-12)
 
+    def unit_code(self, points: Float[Array, "n 3"], mask: Bool[Array, " n"]) -> Float[Array, " code"]:
+        """What a cloud is matched by."""
+        return self(points, mask)
+
 
 def matching_loss(network: nn.Module, params: Any, sample: TrainingSample, key: Array) -> Float[Array, ""]:
     """InfoNCE between the two clouds of each shape."""

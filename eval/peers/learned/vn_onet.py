@@ -39,6 +39,11 @@ class VNONet(OccupancyNetwork):
         vectors, left = self.graph(cloud.points, cloud.mask)
         return channel_normalize(masked_mean(vectors, left)) * self.config.code**0.5, cloud
 
+    def unit_code(self, points: Float[Array, "n 3"], mask: Bool[Array, " n"]) -> Float[Array, " k"]:
+        """What a cloud is matched by: its invariants at unit length, unchanged by turning, moving and scaling it."""
+        x = self.invariants(self.code(points, mask)[0])
+        return x / jnp.sqrt(jnp.sum(x * x) + 1e-12)
+
     def field(
         self, code: tuple[Float[Array, "3 c"], Centered], queries: Float[Array, "q 3"]
     ) -> Float[Array, " q"]:
