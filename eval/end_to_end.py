@@ -29,6 +29,7 @@ from eval.scores.mended_masks import with_added_masks, with_divided_masks
 from eval.scores.temporal_ap import temporal_records
 from eval.scores.tracks import Track, changes_f1, false_changes, score_tracks, tracks_of
 from more2_jax.config import SceneConfig
+from more2_jax.network.on_devices import at_hand
 from more2_jax.network.prior import Prior
 from more2_jax.network.shared_calls import side_by_side
 from more2_jax.scene import add_scan, reconstruct, start_scene
@@ -88,7 +89,7 @@ def prepare(options: Settings) -> tuple[Run, Work]:
     current = open_run("end_to_end", options, {**facts, **stated(options.learned)})
     methods: dict[str, Callable[[KnownScene], list[Track]]] = {}
     for name, config in ours.items():
-        methods[name] = lambda s, c=config: tracks_of(living_scene(s, current.prior, c))
+        methods[name] = lambda s, c=config: tracks_of(living_scene(s, at_hand(current.prior), c))
     for name, stages in peers.items():
         methods[name] = lambda s, p=stages: combined(s.scans, p)
 
