@@ -12,13 +12,14 @@ import jax
 from jax.core import Tracer
 
 Tree = Any  # of arrays
-Copies = dict[jax.Device, jax.Array]
+Device = Any  # `jax.Device`, which checkers take for a variable
+Copies = dict[Device, jax.Array]
 
 _COPIES: dict[int, Copies] = {}  # of arrays that are alive, by identity
 _LOCK = threading.RLock()  # collecting garbage, which may begin anywhere, forgets copies
 
 
-def devices_at_hand() -> list[jax.Device]:
+def devices_at_hand() -> list[Device]:
     """The local devices, or the one that `jax.default_device` names in this thread."""
     chosen = jax.config.jax_default_device  # pyright: ignore[reportAttributeAccessIssue]
     return [chosen] if isinstance(chosen, jax.Device) else jax.local_devices()
@@ -30,14 +31,14 @@ def at_hand(tree: Tree) -> Tree:
     return jax.tree.map(lambda x: copied(x, first), tree)
 
 
-def call_on(device: jax.Device, function: Callable[[Tree], Tree], rows: Tree) -> Tree:
+def call_on(device: Device, function: Callable[[Tree], Tree], rows: Tree) -> Tree:
     """`function` of rows on one of the local devices; where there is no other, as it is."""
     if jax.local_device_count() == 1:
         return function(rows)
     return placed(function, device)(jax.device_put(rows, device))
 
 
-def placed(function: Callable[[Tree], Tree], device: jax.Device) -> Callable[[Tree], Tree]:
+def placed(function: Callable[[Tree], Tree], device: Device) -> Callable[[Tree], Tree]:
     """`function` with the arrays of a `partial`'s arguments on `device`; as it is where it is no `partial`.
 
     Copies live as long as the arrays that they are of.
@@ -48,7 +49,7 @@ def placed(function: Callable[[Tree], Tree], device: jax.Device) -> Callable[[Tr
     return partial(function.func, *args, **function.keywords)
 
 
-def copied(x: Any, device: jax.Device) -> Any:
+def copied(x: Any, device: Device) -> Any:
     """An array on one device as it is on another, copied there the first time; anything else as it is."""
     if not isinstance(x, jax.Array) or isinstance(x, Tracer) or x.devices() == {device}:
         return x

@@ -22,7 +22,7 @@ from typing import Any, TypeVar
 import jax
 import numpy as np
 
-from more2_jax.network.on_devices import call_on, devices_at_hand
+from more2_jax.network.on_devices import Device, call_on, devices_at_hand
 
 Tree = Any  # of arrays
 Item = TypeVar("Item")
@@ -168,7 +168,7 @@ class SharedCalls:
 CURRENT: ContextVar[SharedCalls | None] = ContextVar("shared calls of this thread's scene", default=None)
 
 
-def called(function: Callable[[Tree], Tree], size: int, parts: Sequence[Tree], device: jax.Device) -> Tree:
+def called(function: Callable[[Tree], Tree], size: int, parts: Sequence[Tree], device: Device) -> Tree:
     """`function` of all rows of the parts, filled up to `size` with the first; host arrays."""
     count = sum(len(jax.tree.leaves(p)[0]) for p in parts)
     at = np.where(np.arange(size) < count, np.arange(size), 0)
