@@ -31,6 +31,7 @@ from eval.scores.temporal_ap import temporal_records
 from eval.scores.told_chances import CHANGES, MATCHES, told_chances
 from eval.scores.tracks import Track, changes_f1, false_changes, score_tracks, tracks_of
 from more2_jax.config import EvidenceMatcher, SceneConfig
+from more2_jax.network.on_devices import at_hand
 from more2_jax.network.prior import Prior
 from more2_jax.network.shared_calls import side_by_side
 from more2_jax.scene import add_scan, reconstruct, start_scene
@@ -113,9 +114,8 @@ def prepare(options: Settings) -> tuple[Run, Work]:
 
 def found_tracks(scene: KnownScene, prior: Prior, config: SceneConfig) -> list[Track]:
     """What the method says of a scene."""
-    return tracks_of(
-        living_scene(scene, prior, config), probable=isinstance(config.matching, EvidenceMatcher)
-    )
+    found = living_scene(scene, at_hand(prior), config)
+    return tracks_of(found, probable=isinstance(config.matching, EvidenceMatcher))
 
 
 def on_all_devices(

@@ -11,29 +11,19 @@ import jax.numpy as jnp
 import jaxlie
 import numpy as np
 import pytest
+from traced_scene import DESCENT, SURFACE, little
 
 import more2_jax as m2
-from more2_jax.config import (
-    CodeMatcher,
-    DescentRegistration,
-    FieldRegistration,
-    JointConfig,
-    SurfaceRegistration,
-    SurfaceSearch,
-)
+from more2_jax.config import CodeMatcher, FieldRegistration, JointConfig
 from more2_jax.geometry.full_precision import full_precision
+from more2_jax.meshing.device.values import observed_object, surface_values
 from more2_jax.network.prior import encode_ordered
 from more2_jax.refinement.joint import Observations
 from more2_jax.refinement.pose_graph import OrientedObservations, optimize_pose_graphs
 
 ROWS, REAL, OBJECTS, SEEN = 256, 200, 3, 2
 MASK = np.arange(ROWS) < np.full((OBJECTS, 1), REAL)  # closed over
-DESCENT = DescentRegistration(points=32, sdf_points=32, steps=2, icp_steps=2)
 FIELD = FieldRegistration(turns=2, search_points=16, search_steps=1, keep=1, points=32, steps=2)
-SEARCH = SurfaceSearch(turns=4, keep=2, points=32, dense=64, cells=8, steps=3)
-SURFACE = SurfaceRegistration(
-    search=SEARCH, points=32, steps=2, field_points=32, polish_points=32, polish_steps=1
-)
 JOINT = JointConfig(steps=2, points=32)
 # Traced as they are and in reverse mode they are for their products' precision, below.
 TRANSFORMATIONS = {
@@ -86,6 +76,12 @@ def oriented(x):
     return OrientedObservations(points=seen, normals=seen, mask=mask, residual=jnp.ones(OBJECTS))
 
 
+def surface_of(x, prior, code):
+    """Values of the first object's surface."""
+    first = jax.tree.map(lambda a: a[0], code)
+    return surface_values(prior, observed_object(first, x[0], MASK[0]), little())
+
+
 # By name, functions of the clouds' points, a prior and their codes; all but the first argument is closed over.
 PROGRAMS = {
     "encode": lambda x, prior, code: m2.encode(prior, cloud_of(x)),
@@ -96,6 +92,7 @@ PROGRAMS = {
     "register, field": lambda x, prior, code: m2.register(prior, pairs_of(x, code), FIELD, "upright"),
     "register, surface": lambda x, prior, code: m2.register(prior, pairs_of(x, code), SURFACE),
     "register, upright": lambda x, prior, code: m2.register(prior, pairs_of(x, code), SURFACE, "upright"),
+    "surface_values": surface_of,
     "fit_jointly": lambda x, prior, code: m2.fit_jointly(prior, observations_of(x, code), JOINT),
     "optimize_pose_graphs": lambda x, prior, code: optimize_pose_graphs(oriented(x), 2, "free"),
     "kabsch": lambda x, prior, code: m2.kabsch(x[0], x[1] ** 2, jnp.ones(ROWS)),

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
+import jax
 import numpy as np
 
 from eval.data.flyingshape import flyingshape
@@ -23,6 +24,12 @@ from more2_jax.config import (
 Descending = DescentRegistration | FieldRegistration
 Masks = Literal["true", "merged", "split", "eroded", "wrong", "predicted"]
 OURS = "ours"  # methods whose names begin so
+SCENES_A_CHUNK = 4
+
+
+def scenes_a_chunk() -> int:
+    """By default: no local device is idle."""
+    return max(SCENES_A_CHUNK, jax.local_device_count())
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,8 +63,9 @@ class Options:
     """Whether the method is told where the sensors of every scan stood, where the data say so. Peers never ask."""
     peers: bool = True
     """Also measure what one would use instead, on the same clouds."""
-    chunk: int = 4
-    """Scenes that share a batch."""
+    chunk: int = field(default_factory=scenes_a_chunk)
+    """Scenes that share a batch; by default 4, or one for each local device where there are more. Shards of one run
+    must agree in it."""
     batch: int = 16
     """Clouds or pairs a compiled call takes; shared by all devices."""
     at_once: int = 1

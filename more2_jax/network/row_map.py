@@ -15,6 +15,7 @@ from jax.core import Tracer
 from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Int
 
+from more2_jax.network.on_devices import call_on, devices_at_hand
 from more2_jax.network.shared_calls import CURRENT
 
 Tree = Any  # of arrays
@@ -65,7 +66,8 @@ def in_blocks(function: Callable[[Array], Array], rows: Array, size: int = BLOCK
 def chunked(function: Callable[[Tree], Tree], size: int, rows: Tree, wider: int = WIDER) -> Tree:
     """`function` of `rows` (leading axis b), in calls of `size` rows each: one compiled program whatever b is.
 
-    Accelerators take `wider` times as many; several local devices, or a CPU's cores, take calls in turn, side by side.
+    Accelerators take `wider` times as many; several local devices (but for `jax.default_device`), or a CPU's cores,
+    take calls in turn, side by side. What a `partial` closes over is brought to each device once.
     The last call is filled up with its first row; of no rows there is none. Where scenes are worked on side by side
     (`shared_calls`), the last call is made with rows of other scenes. Where anything is traced, the number of rows is
     part of a larger program anyway: they go in one call. Results are host arrays, but for traced ones.
@@ -102,8 +104,8 @@ def chunked_at(
 def _in_calls(function: Callable[[Tree], Tree], size: int, count: int, taken: Callable[[Rows], Tree]) -> Tree:
     """`chunked_at` of one row or more, without others' rows."""
     places = [_filled(start, size, count) for start in range(0, count, size)]
-    devices, rows = jax.local_devices(), taken(places[0])
-    first = function(rows if len(devices) == 1 else jax.device_put(rows, devices[0]))
+    devices, rows = devices_at_hand(), taken(places[0])
+    first = call_on(devices[0], function, rows)
     if traced(first):  # by what the function closes over, or as part of a larger program
         return function(taken(np.arange(count)))
     calls = _on_devices if len(devices) > 1 else _on_cores if _cores() > 1 else _in_order
@@ -124,17 +126,18 @@ def _filled(start: int, size: int, count: int) -> Rows:
 def _in_order(
     function: Callable[[Tree], Tree], taken: Callable[[Rows], Tree], places: Sequence[Rows], first: Tree
 ) -> Iterator[Tree]:
+    (device,) = devices_at_hand()
     yield jax.device_get(first)
-    yield from (jax.device_get(function(taken(at))) for at in places)
+    yield from (jax.device_get(call_on(device, function, taken(at))) for at in places)
 
 
 def _on_devices(
     function: Callable[[Tree], Tree], taken: Callable[[Rows], Tree], places: Sequence[Rows], first: Tree
 ) -> Iterator[Tree]:
     """The devices take calls in turn, side by side."""
-    devices, begun = jax.local_devices(), [first]
+    devices, begun = devices_at_hand(), [first]
     for n, at in enumerate(places, start=1):
-        begun.append(function(jax.device_put(taken(at), devices[n % len(devices)])))
+        begun.append(call_on(devices[n % len(devices)], function, taken(at)))
         if len(begun) == len(devices):
             yield from map(jax.device_get, begun)
             begun = []
@@ -148,9 +151,11 @@ def _on_cores(
     wide = jax.config.jax_enable_x64  # pyright: ignore[reportAttributeAccessIssue]
     precision = jax.config.jax_default_matmul_precision  # pyright: ignore[reportAttributeAccessIssue]
 
+    (device,) = devices_at_hand()
+
     def call(at: Rows) -> Tree:
         with jax.enable_x64(wide), jax.default_matmul_precision(precision):  # JAX keeps these by thread
-            return jax.device_get(function(taken(at)))
+            return jax.device_get(call_on(device, function, taken(at)))
 
     yield jax.device_get(first)  # compiled once
     if places:

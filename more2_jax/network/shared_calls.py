@@ -7,6 +7,7 @@ program takes. A call is made as soon as it is full, or when every scene waits.
 
 from __future__ import annotations
 
+import itertools
 import os
 import threading
 from collections import defaultdict, deque
@@ -20,6 +21,8 @@ from typing import Any, TypeVar
 
 import jax
 import numpy as np
+
+from more2_jax.network.on_devices import Device, call_on, devices_at_hand
 
 Tree = Any  # of arrays
 Item = TypeVar("Item")
@@ -65,6 +68,7 @@ class SharedCalls:
         self._later = scenes - self._queued  # that begin where another one has ended
         self._working = 0  # scenes between calls: they may still ask for rows
         self._pending: dict[tuple[Hashable, int], deque[Part]] = defaultdict(deque)
+        self._devices = itertools.cycle(devices_at_hand())  # take calls in turn
 
     @contextmanager
     def scene(self) -> Iterator[None]:
@@ -145,7 +149,7 @@ class SharedCalls:
         """One call, filled up with its first row; its rows go to those who asked for them."""
         found, error = None, None
         try:
-            found = called(parts[0].asked.function, size, [p.rows() for p in parts])
+            found = called(parts[0].asked.function, size, [p.rows() for p in parts], next(self._devices))
         except BaseException as raised:  # every scene that has rows in it is told
             error = raised
         with self._changed:
@@ -164,12 +168,12 @@ class SharedCalls:
 CURRENT: ContextVar[SharedCalls | None] = ContextVar("shared calls of this thread's scene", default=None)
 
 
-def called(function: Callable[[Tree], Tree], size: int, parts: Sequence[Tree]) -> Tree:
+def called(function: Callable[[Tree], Tree], size: int, parts: Sequence[Tree], device: Device) -> Tree:
     """`function` of all rows of the parts, filled up to `size` with the first; host arrays."""
     count = sum(len(jax.tree.leaves(p)[0]) for p in parts)
     at = np.where(np.arange(size) < count, np.arange(size), 0)
     rows = jax.tree.map(lambda *x: np.concatenate(x)[at], *parts)
-    return jax.device_get(function(rows))
+    return jax.device_get(call_on(device, function, rows))
 
 
 def program_key(function: Callable[[Tree], Tree], rows: Tree) -> Hashable:

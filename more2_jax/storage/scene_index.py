@@ -1,12 +1,13 @@
 """An index over many stored living scenes: what each object is like and where it stands, to find it elsewhere.
 
-A file of plain arrays, one row an object: F_inv, F_s, extents, place, scene, id. A look-up goes through all rows, some
-at a time, and keeps the best.
+A file of plain arrays, one row an object: F_inv, F_s, extents, place, scene, id. They are not compressed, so a look-up
+reads codes and sizes where they lie, some rows at a time, and keeps the best; of the rest only the rows it shows.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +15,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from more2_jax.storage.mapped_arrays import mapped_arrays
 from more2_jax.storage.scene_folder import DAMAGE, load_scene
 from more2_jax.types import LivingScene, SceneObject
 from more2_jax.whole_file import check_writable, whole_file
@@ -102,13 +104,11 @@ def find(index: SceneIndex, o: SceneObject, count: int, besides: str | None = No
         rows = slice(start, start + ROWS_AT_ONCE)
         likeness = index.inv[rows] @ inv
         score = likeness - SIZE_WEIGHT * np.abs(np.log(index.scale[rows] / np.float32(o.embedding.scale)))
-        if besides is not None:
-            score = np.where(index.scene[rows] == besides, -np.inf, score)
-        order = np.argsort(-score, kind="stable")[:count]
+        order = start + np.argsort(-score, kind="stable")
+        others = (k for k in map(int, order) if besides is None or index.scene[k] != besides)
         best += [
-            Hit(row=start + int(k), score=float(score[k]), likeness=float(likeness[k]))
-            for k in order
-            if score[k] > -np.inf
+            Hit(row=k, score=float(score[k - start]), likeness=float(likeness[k - start]))
+            for k in itertools.islice(others, count)
         ]
         best = sorted(best, key=lambda hit: -hit.score)[:count]
     return best
@@ -123,19 +123,20 @@ def save_index(index: SceneIndex, path: Path) -> None:
     """Writes it, whole or not at all. Raises ValueError where its folder cannot be written."""
     check_writable(path)
     with whole_file(path) as partial, partial.open("wb") as file:
-        np.savez_compressed(file, version=np.array(VERSION), **vars(index))
+        np.savez(file, version=np.array(VERSION), **vars(index))
 
 
 def load_index(path: Path) -> SceneIndex:
-    """Raises ValueError, in one line, where it is missing, damaged or of another version."""
+    """The index in a file, whose arrays stay there until they are looked at.
+
+    Raises ValueError, in one line, where it is missing, damaged or of another version.
+    """
     if not path.is_file():
         raise ValueError(f"{path}: no such index; `more2 index` makes one")
     try:
-        with np.load(path, allow_pickle=False) as file:
-            version = int(file["version"])
-            prior = str(file["prior"])
-            names = [f.name for f in dataclasses.fields(SceneIndex) if f.name != "prior"]
-            arrays = {name: file[name] for name in names}
+        found = mapped_arrays(path)
+        version, prior = int(found["version"]), str(found["prior"])
+        arrays = {f.name: found[f.name] for f in dataclasses.fields(SceneIndex) if f.name != "prior"}
     except DAMAGE as error:
         raise ValueError(f"{path}: not an index ({' '.join(str(error).split())})") from error
     if version != VERSION:

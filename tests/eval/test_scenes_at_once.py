@@ -49,3 +49,10 @@ def test_chunks_are_read_once_and_in_order(names, tmp_path):
     got = list(read_ahead(SimpleNamespace(data=data), options, parts))
     assert [n for part, _ in got for n in part] == names == data.seen
     assert [s for _, scenes in got for s in scenes] == names and all(len(part) <= 2 for part, _ in got)
+
+
+@pytest.mark.parametrize(("devices", "scenes"), [(1, 4), (4, 4), (8, 8)])
+def test_a_chunk_has_a_scene_for_every_device(monkeypatch, tmp_path, devices, scenes):
+    monkeypatch.setattr(jax, "local_device_count", lambda: devices)
+    assert Options(data=tmp_path, out=tmp_path).chunk == scenes
+    assert Options(data=tmp_path, out=tmp_path, chunk=2).chunk == 2

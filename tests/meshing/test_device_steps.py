@@ -12,7 +12,7 @@ from more2_jax.meshing.device import lattice
 from more2_jax.meshing.device import planes as device_planes
 from more2_jax.meshing.device import screened as device_screened
 from more2_jax.meshing.device.correction import OrientedPlanes, corrected
-from more2_jax.meshing.device.neighbors import inliers, nearest_neighbors
+from more2_jax.meshing.device.neighbors import inliers, nearest_neighbors, with_slopes
 from more2_jax.meshing.device.rows import evenly, masked_median, true_places
 from more2_jax.meshing.device.sides import Cloud, Views, free_distance, outward_signs
 from more2_jax.meshing.observed_surface import ObservedSurface, fit_observed_surface
@@ -70,6 +70,22 @@ def test_neighbors_are_as_far_as_by_tree(name):
     assert (np.asarray(index)[: len(points)] < len(points)).all()
     apart = np.linalg.norm(points[:, None] - points[np.asarray(index)[: len(points)]], axis=2)
     np.testing.assert_allclose(distance[: len(points)], apart, atol=1e-6)
+
+
+@pytest.mark.parametrize("name", CLOUDS)
+def test_distances_of_neighbors_are_the_same_with_slopes_by_both_points(name):
+    x, known = jnp.asarray(padded(CLOUDS[name])), real(CLOUDS[name])
+    fixed, index = nearest_neighbors(x, known, 12)
+    np.testing.assert_array_equal(with_slopes(fixed, x, index, known), fixed)
+    weights = np.random.default_rng(0).normal(size=fixed.shape)
+    slope = jax.grad(lambda x: (weights * with_slopes(fixed, x, index, known)).sum())(x)
+    apart = np.asarray(x, np.float64)[:, None] - np.asarray(x, np.float64)[np.asarray(index)]
+    length = np.linalg.norm(apart, axis=2, keepdims=True)
+    told = (length > 0) & np.asarray(known)[:, None, None] & np.asarray(known)[np.asarray(index)][..., None]
+    way = np.where(told, weights[..., None] * apart / np.where(length > 0, length, 1), 0)
+    expected = way.sum(axis=1)
+    np.subtract.at(expected, np.asarray(index), way)
+    np.testing.assert_allclose(slope, expected, atol=2e-4)
 
 
 @pytest.mark.parametrize("factor", [0.0, 1.25, 1.5])

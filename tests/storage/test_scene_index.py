@@ -73,15 +73,45 @@ def test_a_row_says_where_an_object_was_seen_last():
 def test_a_file_holds_it_and_a_bad_one_is_refused_in_a_line(tmp_path):
     index, path = drawn(9), tmp_path / "all.npz"
     save_index(index, path)
-    again = load_index(path)
-    for name, value in vars(index).items():
-        np.testing.assert_array_equal(getattr(again, name), value)
+    assert_equal(load_index(path), index)
     assert [p.name for p in tmp_path.iterdir()] == ["all.npz"]
     path.write_bytes(path.read_bytes()[:200])
     with pytest.raises(ValueError, match=r"all\.npz: not an index"):
         load_index(path)
     with pytest.raises(ValueError, match="no such index"):
         load_index(tmp_path / "none.npz")
+
+
+def assert_equal(found: SceneIndex, expected: SceneIndex) -> None:
+    for name, value in vars(expected).items():
+        np.testing.assert_array_equal(getattr(found, name), value)
+
+
+def test_a_file_stays_where_it_is_and_one_that_is_compressed_is_read(tmp_path):
+    index, ours, packed = drawn(200), tmp_path / "ours.npz", tmp_path / "packed.npz"
+    save_index(index, ours)
+    np.savez_compressed(packed, version=np.array(scene_index.VERSION), **vars(index))
+    mapped, read = load_index(ours), load_index(packed)
+    assert_equal(read, index)
+    for name in ("inv", "scale", "scene", "there"):
+        assert isinstance(getattr(mapped, name), np.memmap) and not isinstance(getattr(read, name), np.memmap)
+    save_index(drawn(200, seed=1), ours)  # another one in its place: what is open stays
+    assert_equal(mapped, index)
+
+
+def test_a_file_that_is_not_all_there_is_refused(tmp_path):
+    """At whatever byte it ends; and with other bytes where a member should begin."""
+    path, content = tmp_path / "all.npz", bytearray()
+    save_index(drawn(20), path)
+    content[:] = path.read_bytes()
+    for length in range(0, len(content), 97):
+        path.write_bytes(content[:length])
+        with pytest.raises(ValueError, match=r"all\.npz: not an index"):
+            load_index(path)
+    content[:200] = bytes(200)
+    path.write_bytes(content)
+    with pytest.raises(ValueError, match=r"all\.npz: not an index"):
+        load_index(path)
 
 
 def test_one_prior_and_some_objects_are_needed():

@@ -49,7 +49,8 @@ def query_planes(planes: OrientedPlanes) -> Float[Array, "k n 8"]:
     Two linear functions of a corner's offset from the point, each as x, y, z and constant: the height over the plane,
     and the logarithm of its weight.
     """
-    near = planes.neighbors[:, :QUERY_PLANES].T.at[0].set(jnp.arange(len(planes.points)))
+    own = jnp.arange(len(planes.points), dtype=planes.neighbors.dtype)
+    near = planes.neighbors[:, :QUERY_PLANES].T.at[0].set(own)
     normal, toward = at_rows(planes.normal, near), at_rows(planes.points, near) - planes.points
     height = (normal * (planes.points - at_rows(planes.center, near))).sum(axis=-1)
     facing = FACING_POWER * jnp.log(jnp.maximum((normal * planes.normal).sum(axis=-1), NOT_FACING))

@@ -22,7 +22,8 @@ def nearest_neighbors(
 ) -> tuple[Float[Array, "n count"], Int[Array, "n count"]]:
     """Distances and rows of the `count` nearest real points of every point, nearest first, itself among them.
 
-    The distances have no gradient. Where there are fewer real points than `count`, some named are not real.
+    The distances have no gradient: `with_slopes` gives them one. Where there are fewer real points than `count`, some
+    named are not real.
     """
     fixed = jax.lax.stop_gradient(points)
 
@@ -35,6 +36,16 @@ def nearest_neighbors(
     blocks = jnp.pad(fixed, ((0, -len(points) % at_once), (0, 0))).reshape(-1, at_once, 3)
     distance, index = jax.lax.map(nearest, blocks)
     return distance.reshape(-1, count)[: len(points)], index.reshape(-1, count)[: len(points)]
+
+
+def with_slopes(
+    distance: Float[Array, "n k"], points: Points, neighbors: Int[Array, "n k"], mask: Mask
+) -> Float[Array, "n k"]:
+    """The distances of `nearest_neighbors` to the bit, with a gradient by the points; 0 of points at one place."""
+    squared = ((points[:, None] - at_rows(points, neighbors)) ** 2).sum(axis=-1)
+    told = (squared > 0) & mask[:, None] & at_rows(mask, neighbors)
+    same = jnp.where(told, jnp.sqrt(jnp.where(told, squared, 1.0)), 0.0)
+    return distance + (same - jax.lax.stop_gradient(same))
 
 
 def inliers(points: Points, mask: Mask, max_factor: Float[Array, ""]) -> Mask:

@@ -12,18 +12,19 @@ from jax import Array
 from jaxtyping import Bool, Float, Int
 
 from more2_jax.config import MeshingConfig
+from more2_jax.geometry.free_space import VIEWS
 from more2_jax.geometry.full_precision import full_precision
-from more2_jax.geometry.points import nearest_index
+from more2_jax.geometry.points import cleared, nearest_index
 from more2_jax.meshing.device.box import in_box
 from more2_jax.meshing.device.correction import OrientedPlanes, areas, corrected
 from more2_jax.meshing.device.lattice import axis_places, corners, upsampled
-from more2_jax.meshing.device.neighbors import inliers, nearest_neighbors
+from more2_jax.meshing.device.neighbors import inliers, nearest_neighbors, with_slopes
 from more2_jax.meshing.device.planes import fit_planes
 from more2_jax.meshing.device.rows import at_rows, evenly, masked_median, real_first
 from more2_jax.meshing.device.screened import screened_poisson
 from more2_jax.meshing.device.sides import Cloud, Views, outward_signs
 from more2_jax.meshing.device.unseen import raised
-from more2_jax.meshing.extract import ACCELERATOR_CHUNK, CHUNK, MAX_LEVEL, SAMPLES
+from more2_jax.meshing.extract import ACCELERATOR_CHUNK, CHUNK, HALF_WIDTH, MAX_LEVEL, SAMPLES
 from more2_jax.meshing.observed_surface import (
     GAP_SPACINGS,
     MIN_GAP,
@@ -53,6 +54,32 @@ class PaddedObject:
     lowest: Float[AnyArray, "*b"] = quantity("length")  # nothing lies below; −∞ where there is no floor
     several: Bool[AnyArray, "*b"] = quantity("invariant")  # whether several scans saw it
     rise: Float[AnyArray, "*b"] = quantity("invariant")  # of the field where nobody looked
+
+
+def observed_object(
+    embedding: Embedding,
+    points: Float[Array, "n 3"],
+    mask: Bool[AnyArray, " n"],
+    half_width: float = HALF_WIDTH,
+) -> PaddedObject:
+    """One padded cloud (meters, the embedding's local frame) as `surface_values` takes it; all may be traced.
+
+    As one scan saw it, without floor, sensors or normals. `half_width`: of the query box, canonical units.
+    """
+    known = jnp.asarray(mask)
+    placed = (cleared(points, known) - embedding.center) / embedding.scale
+    sensors = jnp.full((len(placed), VIEWS, 3), jnp.nan, placed.dtype)
+    views = Views(sensors=sensors, normals=jnp.zeros_like(placed), known=jnp.array(False))
+    return PaddedObject(
+        embedding=dataclasses.replace(embedding, origin=None),
+        points=placed,
+        mask=known,
+        views=views,
+        half_width=jnp.asarray(half_width, placed.dtype),
+        lowest=jnp.asarray(-jnp.inf, placed.dtype),
+        several=jnp.array(False),
+        rise=jnp.zeros((), placed.dtype),
+    )
 
 
 @full_precision
@@ -143,7 +170,8 @@ def observed_level(ask: Ask, o: PaddedObject) -> Float[Array, ""]:
 
 def oriented_planes(ask: Ask, o: PaddedObject) -> OrientedPlanes:
     """Planes through each point's neighbors, outward."""
-    distance, neighbors = nearest_neighbors(o.points, o.mask, PLANE_NEIGHBORS)
+    fixed, neighbors = nearest_neighbors(o.points, o.mask, PLANE_NEIGHBORS)
+    distance = with_slopes(fixed, o.points, neighbors, o.mask)
     planes = fit_planes(o.points, o.mask, neighbors)
     spacing = jnp.maximum(masked_median(distance[:, 1], o.mask), MIN_GAP)
     cloud = Cloud(
