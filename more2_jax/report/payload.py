@@ -20,6 +20,7 @@ from more2_jax.report.thinning import (
     MAX_COARSE_FACES,
     MAX_FACES,
     MAX_POINTS,
+    MAX_POINTS_WITH_DETAILS,
     cluster_vertices,
     coarse_faces,
     kept_share,
@@ -57,10 +58,10 @@ def payload(scene: LivingScene, config: SceneConfig) -> tuple[dict[str, Any], st
     around = _reach(_background(s) for s in scene.scans)
     low, high = np.minimum(objects.low, around.low), np.maximum(objects.high, around.high)
     middle = (low + high) / 2
-    points = kept_share(objects.count + around.count, MAX_POINTS)
+    large = is_large(scene)
+    points = kept_share(objects.count + around.count, MAX_POINTS_WITH_DETAILS if large else MAX_POINTS)
     faces = kept_share(sum(len(o.mesh.faces) for o in scene.objects if o.mesh is not None), MAX_FACES)
     coarse = MAX_COARSE_FACES // len(scene.objects)
-    large = is_large(scene)
     data = {
         "scans": [_scan(s, blob, points, middle) for s in scene.scans],
         "objects": [

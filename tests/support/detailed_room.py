@@ -45,9 +45,10 @@ def _ball(k: int):
 
 @contextmanager
 def small_pages():
-    """Within, a page holds 3 objects, 500 points or 200 faces."""
+    """Within, a page alone holds 3 objects, 500 points or 200 faces; one with details 100 points."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(details, "MOST_IN_ONE_FILE", 3)
+        patch.setattr(payload, "MAX_POINTS_WITH_DETAILS", 100)
         for module in (details, payload):
             patch.setattr(module, "MAX_POINTS", 500)
             patch.setattr(module, "MAX_FACES", 200)
