@@ -1,5 +1,7 @@
 """How heavy the page is: file size, first paint and time a frame for a large room, in a real browser.
 
+So is the page of a building of 1,000 objects, which has finer shapes beside it.
+
 `python -m eval.page_speed --out runs/page_speed`; needs Chromium on the PATH. Without a graphics card Chromium draws
 in software, which is the case measured.
 """
@@ -7,7 +9,7 @@ in software, which is the case measured.
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -20,9 +22,11 @@ from rich.console import Console
 
 from eval.harness.results import cost, write_rows
 from eval.harness.tables import on_screen
+from eval.scores.figures import Row
 from more2_jax.config import SceneConfig
 from more2_jax.network.prior import encode_ordered, load_prior, points_read
 from more2_jax.report import write_report
+from more2_jax.report.details import DETAILS
 from more2_jax.types import Changes, Embedding, LivingScene, Mesh, Observation, ScanRecord, SceneObject
 from train.run.program import run
 
@@ -36,25 +40,52 @@ PAINT = "performance.getEntriesByName('first-contentful-paint').map(e => e.start
 
 
 def main(
-    out: Path, objects: int = 60, points: int = 500_000, scans: int = 3, width: int = 1280, height: int = 720
+    out: Path,
+    objects: int = 60,
+    points: int = 500_000,
+    many: int = 1000,
+    many_points: int = 8_000_000,
+    scans: int = 3,
+    width: int = 1280,
+    height: int = 720,
 ) -> None:
-    """Writes the page of a made-up room and measures it.
+    """Writes the pages of a made-up room and of a made-up building, and measures them.
 
     Args:
-        out: folder for report.html and results.json.
+        out: folder for results.json and for one folder a page.
         objects: in the room, each seen in every scan.
-        points: of all objects together.
+        points: of all objects of the room together.
+        many: objects of the building, whose page has details beside it; 0 leaves it out.
+        many_points: of all objects of the building together.
         scans: visits.
         width: of the window, pixels.
         height: of the window, pixels.
     """
-    out.mkdir(parents=True, exist_ok=True)
-    page = out / "report.html"
-    write_report(room(objects, points // objects, scans), page, SceneConfig())
-    file = cost("file", f"{objects} objects, {points:,} points", page.stat().st_size / 1e6, "MB")
-    rows = [file, *(replace(file, **figure) for figure in measured(page, width, height))]
-    write_rows(out, rows, program="page_speed", objects=objects, points=points, scans=scans)
+    sizes = {"room": (objects, points)} | ({"building": (many, many_points)} if many else {})
+    rows = [
+        row
+        for name, (count, total) in sizes.items()
+        for row in rows_of(out / name, room(count, total // count, scans), total, (width, height))
+    ]
+    stated = {"objects": objects, "points": points, "many": many, "many_points": many_points, "scans": scans}
+    write_rows(out, rows, program="page_speed", **stated)
     Console().print(on_screen(rows, "The page"))
+
+
+def rows_of(folder: Path, scene: LivingScene, points: int, window: tuple[int, int]) -> list[Row]:
+    """Writes the page of a scene with so many points into the folder, and measures it."""
+    folder.mkdir(parents=True, exist_ok=True)
+    page = folder / "report.html"
+    write_report(scene, page, SceneConfig())
+    beside = list((folder / DETAILS).glob("*"))
+    file = cost("file", f"{len(scene.objects):,} objects, {points:,} points", megabytes([page]), "MB")
+    details = [replace(file, name="files beside it", value=megabytes(beside))] if beside else []
+    return [file, *details, *(replace(file, **figure) for figure in measured(page, *window))]
+
+
+def megabytes(files: Sequence[Path]) -> float:
+    """Size of all files."""
+    return sum(p.stat().st_size for p in files) / 1e6
 
 
 def room(objects: int, points: int, scans: int) -> LivingScene:
@@ -135,6 +166,8 @@ def measured(path: Path, width: int, height: int) -> list[dict[str, Any]]:
         found += pace("with all of it", page, turn, lambda level: level == 0)
         found += pace("while the mouse drags", page, drag, lambda level: level > 0)
         found += pace("while objects glide", page, glide, lambda level: level > 0)
+        if page.evaluate("Boolean(window.more2.details)"):
+            found.append({"name": "fine once selected", "unit": "s", "value": seconds_until_fine(page)})
         browser.close()
     return found
 
@@ -153,6 +186,17 @@ def load_times(browser: Any, path: Path, width: int, height: int) -> tuple[float
     times = page.evaluate(PAINT), page.evaluate("performance.now()")
     page.close()
     return times
+
+
+def seconds_until_fine(page: Any) -> float:
+    """From the choice of an object until its detail is read and drawn; the median of some objects."""
+    times = []
+    for k in range(LOADS):
+        began = page.evaluate(f"more2.select(scene.objects[{k}].id) ?? performance.now()")
+        fine = f"more2.details.held.has(stage.builds[{k}]) && !more2.details.reading && more2.settled"
+        page.wait_for_function(fine, timeout=120_000)
+        times.append(page.evaluate("stage.pace.frames.at(-1)[0]") - began)
+    return float(np.median(times)) / 1000
 
 
 def turn(page: Any) -> None:
@@ -189,7 +233,7 @@ def pace(
     page.evaluate("window.more2.paceLog().length = 0")
     before = processor_ms()
     act(page)
-    page.wait_for_function("window.more2.settled")
+    page.wait_for_function("window.more2.settled", timeout=120_000)
     used = processor_ms() - before
     frames = page.evaluate("window.more2.paceLog()")
     times = [took for _, took, level in frames if counts(level)]

@@ -242,10 +242,11 @@ def _save(session: Session, scene: LivingScene, folder: Path, config: SceneConfi
 
 def _store(session: Session, scene: LivingScene, folder: Path, config: SceneConfig) -> None:
     """Writes the folder and its page together: what is cut short leaves both as they were."""
-    from more2_jax.report import report_html
+    from more2_jax.report import report_details, report_html
     from more2_jax.storage.scene_folder import save_scene
 
-    save_scene(scene, folder, config, log=session.unsaved(), page=report_html(scene, config))
+    page, details = report_html(scene, config), report_details(scene)
+    save_scene(scene, folder, config, log=session.unsaved(), page=page, details=details)
 
 
 def _same_prior(scene: LivingScene, name: str | None) -> Prior:

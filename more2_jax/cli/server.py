@@ -1,4 +1,4 @@
-"""`more2 show --serve`: the page and the exports of one living scene over HTTP, for this machine only."""
+"""`more2 show --serve`: the page, its details and the exports of one living scene over HTTP, for this machine only."""
 
 from __future__ import annotations
 
@@ -10,8 +10,9 @@ from urllib.parse import unquote, urlsplit
 
 LOOPBACK = "127.0.0.1"
 PAGE = "report.html"
-TYPES = {  # by what a name ends in: the page, and what `more2 export` writes
-    ".html": "text/html; charset=utf-8",
+DETAILS = "report_details"  # what the page of a large scene reads
+OF_THE_PAGE = {".html": "text/html; charset=utf-8", ".js": "text/javascript; charset=utf-8"}
+TYPES = OF_THE_PAGE | {  # by what a name ends in: what `more2 export` writes, too
     ".json": "application/json",
     ".glb": "model/gltf-binary",
     ".usdc": "model/vnd.usd",
@@ -21,13 +22,17 @@ TYPES = {  # by what a name ends in: the page, and what `more2 export` writes
 
 
 def served_files(folder: Path) -> dict[str, Path]:
-    """What may be asked for, by name: the page, and exports beside or in the living scene's folder.
+    """What may be asked for, by name: the page with its details, and exports beside or in the living scene's folder.
 
     Exports are known by their names, `<folder>.glb` and the like; links that lead elsewhere are left out.
     """
     exports = [p for d in (folder.parent, folder) for p in d.glob("*") if p.stem == folder.name]
-    files = [folder / PAGE, *(p for p in exports if p.suffix in TYPES and p.suffix != ".html")]
-    return {p.name: p for p in files if p.is_file() and not p.is_symlink()}
+    files = {p.name: p for p in exports if p.suffix in TYPES and p.suffix not in OF_THE_PAGE}
+    details = folder / DETAILS
+    if not details.is_symlink():
+        files |= {f"{DETAILS}/{p.name}": p for p in details.glob("*.js")}
+    files[PAGE] = folder / PAGE
+    return {name: p for name, p in files.items() if p.is_file() and not p.is_symlink()}
 
 
 class _Handler(BaseHTTPRequestHandler):
@@ -64,6 +69,8 @@ class _Handler(BaseHTTPRequestHandler):
         self.send_header("Content-Length", str(len(content)))
         self.send_header("Cache-Control", "no-store")
         self.send_header("X-Content-Type-Options", "nosniff")
+        # Another site could run a detail as a script of its own, and so read it.
+        self.send_header("Cross-Origin-Resource-Policy", "same-origin")
         self.end_headers()
         if body:
             self.wfile.write(content)

@@ -10,6 +10,7 @@ from pathlib import Path
 from string import Template
 
 from more2_jax.config import SceneConfig
+from more2_jax.report.details import DETAILS, report_details, write_details
 from more2_jax.report.lists import (
     changes_list,
     object_list,
@@ -25,6 +26,8 @@ from more2_jax.whole_file import whole_file
 
 # In the order in which they need each other; all share one scope.
 PROGRAM = ("data", "room", "trails", "pace", "stage", "labels", "panel", "controls", "main")
+# What a page with details may load: scripts of its own origin. Not every browser takes a folder on disk for one.
+LOADS = " 'self' file:"
 TOGGLES = (  # name, what it says, on at first
     ("meshes", "Surfaces", True),
     ("clouds", "Points of this scan", True),
@@ -37,14 +40,16 @@ TOGGLES = (  # name, what it says, on at first
 
 
 def write_report(scene: LivingScene, path: str | Path, config: SceneConfig) -> None:
-    """Writes the scene's page, `report_html`, as UTF-8."""
+    """Writes the scene's page, `report_html`, and the folder of its details beside it, where it has any."""
+    write_details(Path(path).with_name(DETAILS), report_details(scene))
     with whole_file(path) as partial:
         partial.write_text(report_html(scene, config), encoding="utf-8")
 
 
 def report_html(scene: LivingScene, config: SceneConfig) -> str:
-    """The page as text: one file that loads nothing. What came from files is shown as text, never run.
+    """The page as text. What came from files is shown as text, never run.
 
+    It loads nothing; that of a large scene shows all objects coarsely and finer ones from `report_details` beside it.
     `config` says what counts as static between scans that do not follow each other.
     Raises ValueError without objects.
     """
@@ -54,7 +59,9 @@ def report_html(scene: LivingScene, config: SceneConfig) -> str:
     last = len(scene.scans) - 1
     shown = data["pairs"][f"0-{last}"]
     names = ", ".join(s.name for s in scene.scans)
+    large = "details" in data
     return Template(_asset("page.html")).substitute(
+        loads=LOADS if large else "",
         title=escape(names),
         style=_asset("page.css"),
         headline=escape(shown["headline"]),
@@ -74,7 +81,7 @@ def report_html(scene: LivingScene, config: SceneConfig) -> str:
         blob=blob,
         library=_asset("three.min.js"),
         license=escape(_asset("three.LICENSE")),
-        program="\n".join(_asset(f"{name}.js") for name in PROGRAM),
+        program="\n".join(_asset(f"{name}.js") for name in PROGRAM + ("details",) * large),
     )
 
 

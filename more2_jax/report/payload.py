@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Iterable
+from typing import Any, NamedTuple
 
 import numpy as np
-import trimesh
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
@@ -13,11 +13,14 @@ from more2_jax.config import SceneConfig
 from more2_jax.geometry.poses import apply_pose
 from more2_jax.report.blob import Blob
 from more2_jax.report.coverage import coverage
+from more2_jax.report.details import DETAILS, detail_of, is_large
 from more2_jax.report.palette import color, ink
+from more2_jax.report.shape import Point, anchor_of, cloud_in, index_type, is_closed, surface_in
 from more2_jax.report.thinning import (
     MAX_COARSE_FACES,
     MAX_FACES,
     MAX_POINTS,
+    MAX_POINTS_WITH_DETAILS,
     cluster_vertices,
     coarse_faces,
     kept_share,
@@ -26,8 +29,6 @@ from more2_jax.report.thinning import (
 from more2_jax.report.wording import Verdict, changes_from, doubts_of, headline, phrase, verdict
 from more2_jax.tracking.objects import number_of, place_of
 from more2_jax.types import LivingScene, Mesh, Observation, ScanRecord, SceneObject
-
-Point = Float[np.ndarray, "3"]
 
 
 def pairs_of(scene: LivingScene) -> list[tuple[int, int]]:
@@ -49,29 +50,48 @@ def payload(scene: LivingScene, config: SceneConfig) -> tuple[dict[str, Any], st
     kilometers away from the frame's zero. Lengths are meters, rotations quaternions (x, y, z, w).
     """
     blob = Blob()
-    clouds = [
+    objects = _reach(
         apply_pose(place_of(seen), o.points[o.point_scan == seen.scan])
         for o in scene.objects
         for seen in o.observations
-    ]
-    objects = np.concatenate(clouds)
-    everything = np.concatenate([objects, *(_background(s) for s in scene.scans)])
-    low, high = everything.min(axis=0), everything.max(axis=0)
+    )
+    around = _reach(_background(s) for s in scene.scans)
+    low, high = np.minimum(objects.low, around.low), np.maximum(objects.high, around.high)
     middle = (low + high) / 2
-    points = kept_share(len(everything), MAX_POINTS)
+    large = is_large(scene)
+    points = kept_share(objects.count + around.count, MAX_POINTS_WITH_DETAILS if large else MAX_POINTS)
     faces = kept_share(sum(len(o.mesh.faces) for o in scene.objects if o.mesh is not None), MAX_FACES)
     coarse = MAX_COARSE_FACES // len(scene.objects)
-    return {
+    data = {
         "scans": [_scan(s, blob, points, middle) for s in scene.scans],
-        "objects": [_object(o, blob, points, faces, coarse, middle) for o in scene.objects],
+        "objects": [
+            _object(o, blob, points, faces, coarse, middle) | ({"detail": detail_of(o)} if large else {})
+            for o in scene.objects
+        ],
         "pairs": {f"{a}-{b}": _pair(scene, v, a, b) for (a, b), v in verdicts_of(scene, config).items()},
         "size": (high - low).tolist(),
-        "box": {
-            "low": (objects.min(axis=0) - middle).tolist(),
-            "high": (objects.max(axis=0) - middle).tolist(),
-        },
+        "box": {"low": (objects.low - middle).tolist(), "high": (objects.high - middle).tolist()},
         "share": {"points": points, "faces": faces},
-    }, blob.text()
+    }
+    return data | ({"details": DETAILS} if large else {}), blob.text()
+
+
+class _Reach(NamedTuple):
+    """The box of clouds, and how many points they have."""
+
+    low: Point
+    high: Point
+    count: int
+
+
+def _reach(clouds: Iterable[Float[np.ndarray, "n 3"]]) -> _Reach:
+    """Of clouds taken one at a time, for all of a building at once would fill the memory; of none, nothing."""
+    low, high, count = np.full(3, np.inf), np.full(3, -np.inf), 0
+    for cloud in clouds:
+        low = np.minimum(low, cloud.min(axis=0, initial=np.inf))
+        high = np.maximum(high, cloud.max(axis=0, initial=-np.inf))
+        count += len(cloud)
+    return _Reach(low, high, count)
 
 
 def _pair(scene: LivingScene, verdicts: list[Verdict], a: int, b: int) -> dict[str, Any]:
@@ -105,8 +125,7 @@ def _object(
     o: SceneObject, blob: Blob, points: float, faces: float, coarse: int, middle: Point
 ) -> dict[str, Any]:
     """One object; its cloud and mesh relative to `anchor`, the mean of its points in the reference frame."""
-    anchor = o.points.mean(axis=0)
-    parts = [random_subsample(o.points[o.point_scan == seen.scan], points) for seen in o.observations]
+    anchor = anchor_of(o)
     mesh = None if o.mesh is None else cluster_vertices(o.mesh, faces)
     return {
         "id": o.id,
@@ -116,21 +135,17 @@ def _object(
         "ink": ink(number_of(o)),
         "coverage": None if o.mesh is None else coverage(o.mesh, o.points),
         "observations": [_observation(o, seen, anchor, middle) for seen in o.observations],
-        "cloud": blob.add_points(np.concatenate(parts) - anchor),
-        "counts": [len(p) for p in parts],
+        **cloud_in(blob, o, points),
         "mesh": None if mesh is None else _mesh(mesh, blob, anchor, coarse),
     }
 
 
 def _mesh(mesh: Mesh, blob: Blob, anchor: Point, most: int) -> dict[str, Any]:
     """A surface, and a version of it with about `most` faces, on the same vertices, to be drawn while things move."""
-    index = np.uint16 if len(mesh.vertices) <= 65536 else np.uint32
-    solid = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     return {
-        "vertices": blob.add_points(mesh.vertices - anchor),
-        "faces": blob.add(mesh.faces.reshape(-1).astype(index)),
-        "coarse": blob.add(coarse_faces(mesh, most).reshape(-1).astype(index)),
-        "closed": bool(solid.is_watertight and solid.volume > 0),
+        **surface_in(blob, mesh, anchor),
+        "coarse": blob.add(coarse_faces(mesh, most).reshape(-1).astype(index_type(mesh))),
+        "closed": is_closed(mesh),
     }
 
 

@@ -11,6 +11,9 @@ from more2_jax.types import Mesh
 MAX_POINTS = 500_000  # of a page
 MAX_FACES = 150_000  # of a page
 MAX_COARSE_FACES = 10_000  # of a page, while things move
+MAX_POINTS_WITH_DETAILS = 200_000  # of a page that reads finer ones
+MAX_DETAIL_POINTS = 30_000  # of one object beside the page
+MAX_DETAIL_FACES = 30_000  # of one object beside the page
 
 
 def kept_share(total: int, most: int) -> float:

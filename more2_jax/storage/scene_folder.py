@@ -14,7 +14,7 @@ import os
 import shutil
 import zipfile
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -42,12 +42,14 @@ from more2_jax.types import (
 from more2_jax.whole_file import check_writable
 
 PAGE = "report.html"
+DETAILS = "report_details"  # of a large scene's page
 WRITTEN = (
     "scene.json",
     "objects",
     "background.ply",
     "embeddings.npz",
     PAGE,
+    DETAILS,
     "run.log",
     "config.yaml",
 )
@@ -105,12 +107,19 @@ def _is_scene(folder: Path) -> bool:
 
 
 def save_scene(
-    scene: LivingScene, folder: str | Path, config: SceneConfig, *, log: str = "", page: str | None = None
+    scene: LivingScene,
+    folder: str | Path,
+    config: SceneConfig,
+    *,
+    log: str = "",
+    page: str | None = None,
+    details: Iterable[tuple[str, str]] = (),
 ) -> None:
     """Writes the living-scene folder, whole or not at all; a living scene already there is replaced.
 
     `log` is appended to the folder's run.log. `page` is the scene's HTML (`report.report_html`), stored as
-    report.html; with None the folder has no page, `more2 show` makes one. Other files in the folder are kept.
+    report.html; with None the folder has no page, `more2 show` makes one. `details` are names and texts of the files
+    the page reads (`report.report_details`), taken one at a time. Other files in the folder are kept.
     Raises ValueError where `check_output` does, when a number of the scene is not finite, without objects, or if
     another process works on the folder.
     """
@@ -119,10 +128,17 @@ def save_scene(
         raise ValueError("the living scene has no objects; needed at least one")
     folder = Path(folder).resolve()
     with scene_lock(folder):
-        _swap_in(scene, folder, config, log, page)
+        _swap_in(scene, folder, config, log, page, details)
 
 
-def _swap_in(scene: LivingScene, folder: Path, config: SceneConfig, log: str, page: str | None) -> None:
+def _swap_in(
+    scene: LivingScene,
+    folder: Path,
+    config: SceneConfig,
+    log: str,
+    page: str | None,
+    details: Iterable[tuple[str, str]],
+) -> None:
     """Fills a folder beside, and puts it in the place of the one that is there."""
     new, old = _beside(folder, "new"), _beside(folder, "old")
     folder.parent.mkdir(parents=True, exist_ok=True)
@@ -131,7 +147,9 @@ def _swap_in(scene: LivingScene, folder: Path, config: SceneConfig, log: str, pa
     for left_over in (new, old):
         shutil.rmtree(left_over, ignore_errors=True)
     try:
-        _fill(new, scene, config, _log_of(folder) + log, page)
+        _fill(new, scene, config, _log_of(folder) + log)
+        if page is not None:
+            _write_page(new, page, details)
         _keep_other_files(folder, new)
     except BaseException:
         shutil.rmtree(new, ignore_errors=True)
@@ -142,7 +160,7 @@ def _swap_in(scene: LivingScene, folder: Path, config: SceneConfig, log: str, pa
     shutil.rmtree(old, ignore_errors=True)
 
 
-def _fill(folder: Path, scene: LivingScene, config: SceneConfig, log: str, page: str | None) -> None:
+def _fill(folder: Path, scene: LivingScene, config: SceneConfig, log: str) -> None:
     (folder / "objects").mkdir(parents=True)
     text = json.dumps(scene_to_json(scene), indent=1, allow_nan=False)
     (folder / "scene.json").write_text(text + "\n", encoding="utf-8")
@@ -156,8 +174,13 @@ def _fill(folder: Path, scene: LivingScene, config: SceneConfig, log: str, page:
     np.savez_compressed(folder / "embeddings.npz", **({"id": ids} | stacked))  # type: ignore[arg-type]
     (folder / "config.yaml").write_text(to_yaml(config), encoding="utf-8")
     (folder / "run.log").write_text(log, encoding="utf-8")
-    if page is not None:
-        (folder / PAGE).write_text(page, encoding="utf-8")
+
+
+def _write_page(folder: Path, page: str, details: Iterable[tuple[str, str]]) -> None:
+    (folder / PAGE).write_text(page, encoding="utf-8")
+    for name, text in details:
+        (folder / DETAILS).mkdir(exist_ok=True)
+        (folder / DETAILS / name).write_text(text, encoding="utf-8")
 
 
 def _write_background(path: Path, scans: Sequence[ScanRecord]) -> None:

@@ -1,4 +1,4 @@
-"""The server of a living scene: this machine only, the page and the exports only, ended by ctrl-C."""
+"""The server of a living scene: this machine only, the page, its details and the exports only, ended by ctrl-C."""
 
 import http.client
 import os
@@ -27,6 +27,11 @@ def served(tmp_path):
     (tmp_path / "other.glb").write_text("secret")
     (tmp_path / "key").write_text("secret")
     (tmp_path / "room.ply").symlink_to(tmp_path / "key")
+    (tmp_path / "room.js").write_text("secret")
+    (room / "report_details").mkdir()
+    (room / "report_details" / "0.js").write_text("more2Detail()")
+    (room / "report_details" / "notes.txt").write_text("secret")
+    (room / "report_details" / "1.js").symlink_to(tmp_path / "key")
     server = scene_server(room)
     threading.Thread(target=lambda: server.serve_forever(poll_interval=0.02), daemon=True).start()
     yield room, server
@@ -58,6 +63,22 @@ def test_the_page_and_the_exports(served):
     assert ask(server)[0] == 404
 
 
+def test_the_details_are_scripts_of_the_page_and_of_no_other_site(served):
+    connection = http.client.HTTPConnection(*served[1].server_address[:2], timeout=5)
+    connection.request("GET", "/report_details/0.js")
+    answer = connection.getresponse()
+    assert (answer.status, answer.read()) == (200, b"more2Detail()")
+    assert answer.headers["Content-Type"].startswith("text/javascript")
+    assert answer.headers["Cross-Origin-Resource-Policy"] == "same-origin"
+
+
+def test_a_folder_of_details_that_leads_elsewhere_is_left_out(served):
+    room, server = served
+    (room / "report_details").rename(room.parent / "elsewhere")
+    (room / "report_details").symlink_to(room.parent / "elsewhere")
+    assert ask(server, "/report_details/0.js")[0] == 404
+
+
 @pytest.mark.parametrize(
     "path",
     [
@@ -79,7 +100,8 @@ def test_the_page_and_the_exports(served):
         "/./report.html",
         "/%2froom.glb",
     ]
-    + ["/\\..\\key"],
+    + ["/\\..\\key", "/room.js", "/0.js", "/report_details", "/report_details/"]
+    + [f"/report_details/{name}" for name in ("notes.txt", "1.js", "2.js", "../scene.json", "%2e%2e/key")],
 )
 def test_nothing_else(served, path):
     status, body = ask(served[1], path)

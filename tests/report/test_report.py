@@ -1,14 +1,13 @@
 """The page stands alone, says what the scene says, shows names from files as text, and keeps to its size."""
 
-import base64
 import dataclasses
-import gzip
 import json
 import re
 
 import numpy as np
 import pytest
 from factories import WORLD_M, cube, living_scene, scene_object, turn_z
+from packed_arrays import array_of, points_back, unpacked
 from report_html_parser import Page
 from scipy.spatial.transform import Rotation
 from skimage.color import rgb2lab
@@ -178,20 +177,6 @@ def test_first_and_last_are_compared_by_the_settings():
 
 
 # --- what goes into the page --------------------------------------------------------------------------------
-
-
-def unpacked(text: str) -> bytes:
-    return gzip.decompress(base64.b64decode(text))
-
-
-def array_of(data: bytes, reference: dict) -> np.ndarray:
-    return np.frombuffer(
-        data, "<" + {"uint16": "u2", "uint32": "u4"}[reference["type"]], reference["count"], reference["at"]
-    )
-
-
-def points_back(data: bytes, reference: dict) -> np.ndarray:
-    return np.array(reference["low"]) + reference["step"] * array_of(data, reference).reshape(-1, 3)
 
 
 def test_points_come_back_to_half_a_step():

@@ -65,15 +65,16 @@ def opener(browser, report, said):
     contexts = []
 
     def opening(path=report, viewport=WIDE, init=None, **options):
+        address = path if isinstance(path, str) else path.as_uri()
         context = browser.new_context(viewport=viewport, **({"reduced_motion": "reduce"} | options))
         contexts.append(context)
         page = context.new_page()
         page.on("console", lambda message: said.append(message.text))
         page.on("pageerror", lambda error: said.append(str(error)))
-        page.on("request", lambda r: None if r.url == path.as_uri() else said.append(f"asks for {r.url}"))
+        page.on("request", lambda r: None if r.url == address else said.append(f"asks for {r.url}"))
         if init:
             page.add_init_script(init)
-        page.goto(path.as_uri())
+        page.goto(address)
         until(page, "Boolean(window.more2?.ready)")
         return page
 
