@@ -76,6 +76,9 @@ FIGURES = {
     "moments": ("moments", ""),
     "right moments": ("right moments", ""),
     "sign": ("sign", ""),
+    "L1 of uniform queries": ("L1 of uniform queries", ""),
+    "L1 near the surface": ("L1 near the surface", ""),
+    "Chamfer-L1 at the observed level": ("Chamfer-L1 at the observed level", ""),
     "error of distances": ("error of distances", ""),
     "overlap": ("overlap", ""),
     "orientation": ("orientation", ""),
@@ -92,7 +95,7 @@ SCANS = re.compile(r"scans \d+")  # groups that are kept beside all scenes
 SENSE = {"higher": 1.0, "lower": -1.0}
 # What programs count, where it is not pairs.
 COUNTED = {"reconstruction": "objects", "segmentation": "objects"}
-NO_RIVALS = ("bfloat16", "building", "survival")  # programs whose lines are not methods
+NO_RIVALS = ("bfloat16", "building", "decoding", "survival")  # programs whose lines are not methods
 
 
 def main(keep: Path | None = None, name: str = "", docs: Path = DOCS) -> None:
