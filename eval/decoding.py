@@ -15,7 +15,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -53,6 +53,8 @@ from train.shards.signed_distance import BOX
 
 TRUTH = "the true points, one half against the other"
 SAMPLES = 20_000  # on each mesh
+NOISE = 0.005  # of every coordinate of the clouds scored, a standard deviation; canonical units
+SEED = 0  # of those clouds
 ERROR = Figure(
     name="L1 of uniform queries", key="uniform", statistic="mean", unit="10⁻³", scale=1000, better="lower"
 )
@@ -77,9 +79,7 @@ def main(
     views: tuple[int, ...] = (3,),
     split: str = "val",
     resolution: int = 32,
-    noise: float = 0.005,
     most: int | None = None,
-    seed: int = 0,
 ) -> None:
     """Trains an encoder with each decoder of the study and scores them.
 
@@ -94,29 +94,40 @@ def main(
         views: numbers of depth images that a cloud is merged from.
         split: `test` for the final figure; `val` while choosing.
         resolution: cells of the meshes' grid, a side.
-        noise: standard deviation of every coordinate, canonical units.
         most: score no more shapes than this.
-        seed: of the clouds scored.
     """
-    deadline = time.monotonic() + 60 * minutes
-    settings = load_config(config, TrainingRun)
-    if steps:
-        settings = dataclasses.replace(settings, training=dataclasses.replace(settings.training, steps=steps))
-    study = opened(settings, shards, out / "training")
-    weights, done = trained(study, deadline)
+    study = opened(settings_of(config, steps), shards, out / "training")
+    weights, done = trained(study, time.monotonic() + 60 * minutes)
     shapes = [view[k] for view in open_mix(val_shards or shards, split).views for k in range(len(view))]
-    scoring = partial(shape_records, study.start.config, weights, resolution=resolution)
     for number in views:
-        seeing = partial(see_twice, views=number, points=sum(len(s["sdf_uniform"]) for s in shapes[:1]))
-        stated = {"program": "decoding", "masks": "true", "preset": "paper", "prior": config.stem}
-        stated |= {"weights": "trained here", "steps": done, "views": number, "noise": noise, "seed": seed}
-        facts = {"dataset": f"shapes of split {split}", "regime": f"{number} views, {done} steps"}
-        stated |= {"resolution": resolution, "data": {**facts, "digest": "–"}}
+        stated = {"prior": config.stem, "steps": done, "views": number, "resolution": resolution}
+        stated |= {"data": {"dataset": f"shapes of split {split}", "regime": f"{number} views, {done} steps"}}
         folder = opened_folder(out / f"{number}_views", stated, shapes[:most])
-        for name in track(folder.missing(), description=f"{number} views"):
-            shape, rng = shapes[int(name)], np.random.default_rng((seed, number, int(name)))
-            write_json(folder.file(name), scoring(seeing(shape, noise=noise, rng=rng), shape))
-        write(folder)
+        score(folder, study.start.config, weights, shapes)
+
+
+def settings_of(config: Path, steps: int) -> TrainingRun:
+    """The configuration, with another number of steps if it is not 0."""
+    settings = load_config(config, TrainingRun)
+    training = dataclasses.replace(settings.training, steps=steps or settings.training.steps)
+    return dataclasses.replace(settings, training=training)
+
+
+def score(
+    folder: RunFolder,
+    config: PriorConfig,
+    weights: Mapping[str, Weights],
+    shapes: Sequence[Mapping[str, np.ndarray]],
+) -> None:
+    """Records of every shape that has none yet, then tables."""
+    told = folder.settings
+    number = told["views"]
+    for name in track(folder.missing(), description=f"{number} views"):
+        shape = shapes[int(name)]
+        rng = np.random.default_rng((SEED, number, int(name)))
+        seen = see_twice(shape, number, len(shape["sdf_uniform"]), NOISE, rng)
+        write_json(folder.file(name), shape_records(config, weights, seen, shape, told["resolution"]))
+    write(folder)
 
 
 def opened(settings: TrainingRun, shards: tuple[Path, ...], out: Path) -> Study:
@@ -139,6 +150,8 @@ def opened(settings: TrainingRun, shards: tuple[Path, ...], out: Path) -> Study:
 
 def opened_folder(out: Path, stated: dict[str, Any], shapes: list[Any]) -> RunFolder:
     """Where the records of every shape lie; those of other settings, as of fewer steps, are forgotten."""
+    stated = {"program": "decoding", "masks": "true", "preset": "paper", "weights": "trained here"} | stated
+    stated["data"] = {"digest": "–"} | stated.get("data", {})
     claim(out, stated, fresh=True)
     names = tuple(f"{k:04}" for k in range(len(shapes)))
     return RunFolder(out=out, names=names, settings=stated, right_deg=0.0)

@@ -118,7 +118,6 @@ def test_every_decoder_trains_an_encoder_of_its_own_and_a_stopped_run_is_the_run
     jax.tree.map(np.testing.assert_array_equal, resumed, whole)
 
 
-@pytest.mark.slow
 def test_from_shards_to_figures(tmp_path, start, shards, monkeypatch):
     monkeypatch.setattr(decoding, "load_config", lambda *_: SETTINGS)
     decoding.main((shards,), tmp_path / "out", views=(2,), resolution=8, most=3)
