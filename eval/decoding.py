@@ -1,14 +1,21 @@
-"""How a query should meet the code: the paper's decoding study, on shapes that no training saw.
+"""How a query should meet the code: the paper's decoding study, encoder and decoder trained together for each.
 
-`python -m eval.decoding --shards data/real data/procedural --out runs/decoding`
+`python -m eval.decoding --shards train/shapes/infinigen.npz train/shapes/open.npz --out runs/decoding`
 
-Every decoder is trained for the same steps on the same batches, on the frozen codes of one encoder, and then asked
-for shapes of another split: share of right signs near the surface, intersection over union, error of the distance.
+Every decoder starts with an encoder of the same random weights, sees the same batches in the same order for equal
+steps, and is then asked for shapes that no training saw: error of distances at uniform queries and near the surface,
+right signs, intersection over union, and the Chamfer distance of the mesh. A run that was stopped goes on where it was.
+
+The true surface is the points of all depth views, since packed shapes have no meshes; distances to it cannot be less
+than those of one half of the points to the other, which is a row of its own.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import math
+import time
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -16,186 +23,225 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
-from jaxtyping import Float
+import trimesh
+from jaxtyping import Array, Float
 from rich.console import Console
 from rich.progress import track
+from scipy.spatial import KDTree
+from skimage.measure import marching_cubes
 
 from eval.harness.results import circumstances_now
-from eval.harness.run_folder import write_json
-from eval.harness.runs import weights_digest
+from eval.harness.run_folder import RunFolder, claim, write_json
 from eval.harness.tables import latex, markdown, on_screen
-from eval.peers.learned_decoders import VARIANTS, decoder_of, decoder_step, drawn, optimizer, start
-from eval.prior_scores import BATCH, SEEN, see_twice
+from eval.peers.decoder_training import Study, Weights, distances, trained
+from eval.peers.learned_decoders import VARIANTS, Variant
+from eval.prior_scores import see_twice
 from eval.scores.figures import Figure, Record, rows_of
-from more2_jax.config import load_config
+from eval.scores.mesh_scores import surface_points, volume_iou
+from more2_jax.config import PriorConfig, load_config
 from more2_jax.geometry.points import farthest_points
-from more2_jax.network.prior import (
-    Prior,
-    encode_ordered,
-    field_sdf,
-    load_prior,
-    object_field,
-    points_read,
-)
+from more2_jax.meshing.grid import Grid, Lattice, cube
+from more2_jax.network.prior import Prior, encode_ordered
+from more2_jax.network.row_map import in_blocks
+from train.run.batches import resident
+from train.run.devices import device_mesh
 from train.run.program import run
-from train.run.settings import TrainingConfig, TrainingRun
-from train.run.shape_mix import load_mix
-from train.shards.shards import open_shards
+from train.run.settings import TrainingRun
+from train.run.shape_mix import open_mix
+from train.run.start import started_cold
+from train.shards.signed_distance import BOX
 
-OWN = "as shipped: inner, DeepSDF, look-up, trained longer"
-SIGN = Figure(name="sign near the surface", key="sign", statistic="mean", unit="%", scale=100)
+TRUTH = "the true points, one half against the other"
+SAMPLES = 20_000  # on each mesh
+NOISE = 0.005  # of every coordinate of the clouds scored, a standard deviation; canonical units
+SEED = 0  # of those clouds
+ERROR = Figure(
+    name="L1 of uniform queries", key="uniform", statistic="mean", unit="10⁻³", scale=1000, better="lower"
+)
+SIGN = Figure(name="sign", key="sign", statistic="mean", unit="%", scale=100)
 FIGURES = [
+    ERROR,
+    dataclasses.replace(ERROR, name="L1 near the surface", key="near"),
+    dataclasses.replace(ERROR, name="Chamfer-L1", key="chamfer"),
+    dataclasses.replace(ERROR, name="Chamfer-L1 at the observed level", key="chamfer_observed"),
     dataclasses.replace(SIGN, name="IoU", key="iou"),
     SIGN,
-    dataclasses.replace(
-        SIGN,
-        name="error of the distance near the surface",
-        key="error",
-        unit="10⁻³",
-        scale=1000,
-        better="lower",
-    ),
 ]
 
 
 def main(
     shards: tuple[Path, ...],
     out: Path,
-    prior: str = "small",
-    config: Path = Path("configs/small.yaml"),
-    steps: int = 600,
-    learning_rate: float = 1e-3,
-    views: tuple[int, ...] = (3, 1),
-    split: str = "test",
-    points: int = 20_000,
-    noise: float = 0.005,
+    val_shards: tuple[Path, ...] = (),
+    config: Path = Path("configs/decoding.yaml"),
+    steps: int = 0,
+    minutes: float = math.inf,
+    views: tuple[int, ...] = (3,),
+    split: str = "val",
+    resolution: int = 32,
     most: int | None = None,
-    seed: int = 0,
 ) -> None:
-    """Trains the decoders of the study and scores them.
+    """Trains an encoder with each decoder of the study and scores them.
 
     Args:
-        shards: folders that `python -m train.prepare` wrote; one that is named twice is drawn from twice as often.
-        out: a folder for the results of every number of views.
-        prior: whose encoder is used: name of shipped weights, or a file.
-        config: YAML whose `training` says how shapes are sampled.
-        steps: of Adam, for every decoder.
-        learning_rate: at the first step; falls as a cosine.
+        shards: folders that `python -m train.prepare` wrote, or files of `train.tools.pack`; one that is named twice is
+            drawn from twice as often.
+        out: checkpoints, and a folder for the results of every number of views.
+        val_shards: of the shapes scored; by default `shards`.
+        config: YAML with `model` and `training`, as `train.prior` reads it.
+        steps: of Adam, for every decoder; by default the configuration's.
+        minutes: of training; a run that needs more goes on when the command is given again.
         views: numbers of depth images that a cloud is merged from.
         split: `test` for the final figure; `val` while choosing.
-        points: uniform in the unit cube, for the intersection over union.
-        noise: standard deviation of every coordinate, canonical units.
+        resolution: cells of the meshes' grid, a side.
         most: score no more shapes than this.
-        seed: of the decoders' weights and of the clouds scored.
     """
-    own, training = load_prior(prior), load_config(config, TrainingRun).training
-    weights = trained(own, shards, training, steps, learning_rate, seed)
-    stated = {"program": "decoding", "prior": prior, "weights": weights_digest(own)}
-    stated |= {"preset": "paper", "masks": "true"}
+    study = opened(settings_of(config, steps), shards, out / "training")
+    weights, done = trained(study, time.monotonic() + 60 * minutes)
+    shapes = [view[k] for view in open_mix(val_shards or shards, split).views for k in range(len(view))]
     for number in views:
-        records = scored(own, weights, shards, split, number, points, noise, most, seed)
-        facts = {"dataset": f"shapes of split {split}", "regime": f"{number} views", "digest": "–"}
-        write(out / f"{number}_views", stated | {"data": facts, "steps": steps, "views": number}, records)
+        stated = {"prior": config.stem, "steps": done, "views": number, "resolution": resolution}
+        stated |= {"data": {"dataset": f"shapes of split {split}", "regime": f"{number} views, {done} steps"}}
+        folder = opened_folder(out / f"{number}_views", stated, shapes[:most])
+        score(folder, study.start.config, weights, shapes)
 
 
-def trained(
-    prior: Prior, shards: tuple[Path, ...], training: TrainingConfig, steps: int, rate: float, seed: int
-) -> dict[str, Any]:
-    """Weights of every variant after `steps`."""
-    shapes, rows = load_mix(shards, "train")
-    codes = encode_ordered(
-        prior, jnp.zeros((points_read(prior.config), 3)), jnp.ones(points_read(prior.config), bool)
+def settings_of(config: Path, steps: int) -> TrainingRun:
+    """The configuration, with another number of steps if it is not 0."""
+    settings = load_config(config, TrainingRun)
+    training = dataclasses.replace(settings.training, steps=steps or settings.training.steps)
+    return dataclasses.replace(settings, training=training)
+
+
+def score(
+    folder: RunFolder,
+    config: PriorConfig,
+    weights: Mapping[str, Weights],
+    shapes: Sequence[Mapping[str, np.ndarray]],
+) -> None:
+    """Records of every shape that has none yet, then tables."""
+    told = folder.settings
+    number = told["views"]
+    for name in track(folder.missing(), description=f"{number} views"):
+        shape = shapes[int(name)]
+        rng = np.random.default_rng((SEED, number, int(name)))
+        seen = see_twice(shape, number, len(shape["sdf_uniform"]), NOISE, rng)
+        write_json(folder.file(name), shape_records(config, weights, seen, shape, told["resolution"]))
+    write(folder)
+
+
+def opened(settings: TrainingRun, shards: tuple[Path, ...], out: Path) -> Study:
+    """Training shapes in memory, and the random weights that every encoder starts with.
+
+    Raises ValueError if `out` is of other shapes or settings; the number of steps may differ.
+    """
+    training = repr(dataclasses.replace(settings.training, steps=0))
+    stated = {"shards": [str(s) for s in shards], "model": repr(settings.model), "training": training}
+    claim(out, stated, fresh=False)
+    mix, mesh = open_mix(shards, "train"), device_mesh(settings.training.batch)
+    return Study(
+        training=settings.training,
+        start=started_cold(settings, mix, "decoding"),
+        batches=resident(mix, settings.training, mesh),
+        mesh=mesh,
+        out=out,
     )
-    weights = start(prior, codes, seed)
-    states: dict[str, Any] = {name: optimizer(steps, rate).init(w) for name, w in weights.items()}
-    here, size = jnp.asarray(rows), points_read(prior.config)
-    for number in track(range(steps), description="training"):
-        sample, _ = drawn(shapes, here, jnp.asarray(number), config=training, points=size)
-        weights, states, losses = decoder_step(
-            weights, states, prior, sample, config=training, steps=steps, learning_rate=rate
-        )
-        if number % 100 == 99:
-            Console().print(number + 1, {k: round(float(v), 4) for k, v in losses.items()}, highlight=False)
-    return weights
 
 
-def scored(
-    prior: Prior,
-    weights: dict[str, Any],
-    shards: tuple[Path, ...],
-    split: str,
-    views: int,
-    points: int,
-    noise: float,
-    most: int | None,
-    seed: int,
-) -> dict[str, list[Record]]:
-    """A record a shape and decoder."""
-    shapes, found = open_shards(tuple(dict.fromkeys(shards)), split), {}
-    count = min(len(shapes), most or len(shapes))
-    for begin in track(range(0, count, BATCH), description=f"{views} views"):
-        index = [min(k, count - 1) for k in range(begin, begin + BATCH)]  # fillers repeat the last
-        seen = [
-            see_twice(shapes[k], views, points, noise, np.random.default_rng((seed, views, k))) for k in index
-        ]
-        batch = (np.stack([s[name] for s in seen]) for name in SEEN)
-        scores = jax.device_get(score_batch(prior, weights, *batch))
-        for k, n in enumerate(index[: count - begin]):
-            meta = shapes.meta[n]
-            found[meta["name"]] = [
-                {"method": m, "category": meta["category"]} | {key: float(v[k]) for key, v in s.items()}
-                for m, s in scores.items()
-            ]
+def opened_folder(out: Path, stated: dict[str, Any], shapes: list[Any]) -> RunFolder:
+    """Where the records of every shape lie; those of other settings, as of fewer steps, are forgotten."""
+    stated = {"program": "decoding", "masks": "true", "preset": "paper", "weights": "trained here"} | stated
+    stated["data"] = {"digest": "–"} | stated.get("data", {})
+    claim(out, stated, fresh=True)
+    names = tuple(f"{k:04}" for k in range(len(shapes)))
+    return RunFolder(out=out, names=names, settings=stated, right_deg=0.0)
+
+
+def shape_records(
+    config: PriorConfig,
+    weights: Mapping[str, Weights],
+    seen: Mapping[str, np.ndarray],
+    shape: Mapping[str, np.ndarray],
+    resolution: int,
+) -> list[Record]:
+    """A record a decoder, and one of the true points against themselves."""
+    surface = np.asarray(shape["views"], np.float64).reshape(-1, 3)
+    halves = np.array_split(np.random.default_rng(0).permutation(surface), 2)
+    lattice = cube(resolution, BOX)
+    asked = [seen["near"][:, :3], seen["uniform"][:, :3], seen["clouds"][0]]
+    asked.append(lattice.corners() @ seen["rotation"][0].T)
+    queries, ends = np.concatenate(asked).astype(np.float32), np.cumsum([len(a) for a in asked])[:-1]
+    found: list[Record] = [
+        {"method": TRUTH, "chamfer": chamfer(*halves), "chamfer_observed": chamfer(*halves)}
+    ]
+    for name, variant in VARIANTS.items():
+        cloud = seen["clouds"][0].astype(np.float32)
+        values = np.asarray(answered(weights[name], cloud, queries, variant=variant, config=config))
+        near, uniform, observed, grid = np.split(values, ends)
+        grid, level = grid.reshape(lattice.shape), float(np.median(observed))
+        scores = field_scores(near, seen["near"][:, 3], uniform, seen["uniform"][:, 3])
+        scores["chamfer"] = mesh_chamfer(grid, lattice, surface)
+        scores["chamfer_observed"] = mesh_chamfer(grid - level, lattice, surface)
+        found.append({"method": name} | scores)
     return found
 
 
-@jax.jit
-def score_batch(
-    prior: Prior,
-    weights: dict[str, Any],
-    clouds: Float[Array, "b 2 n 3"],
-    near: Float[Array, "b q 4"],
-    uniform: Float[Array, "b u 4"],
-) -> dict[str, dict[str, Array]]:
-    """The scores of every decoder for the first cloud of each shape."""
-
-    def one(cloud: Array, near: Array, uniform: Array) -> dict[str, dict[str, Array]]:
-        real = jnp.ones(len(cloud), bool)
-        code = encode_ordered(prior, *farthest_points(cloud, real, points_read(prior.config)))
-        fields = {
-            name: partial(decoder_of(prior, v).apply, weights[name], code) for name, v in VARIANTS.items()
-        } | {OWN: partial(field_sdf, prior, object_field(prior, code))}
-        return {name: scores_of(field, near, uniform, name) for name, field in fields.items()}
-
-    # One after the other: twenty thousand queries of one shape fill the processor.
-    return jax.lax.map(lambda x: one(*x), (clouds[:, 0], near, uniform))
+@partial(jax.jit, static_argnames=("variant", "config"))
+def answered(
+    weights: Weights,
+    cloud: Float[Array, "n 3"],
+    queries: Float[Array, "q 3"],
+    *,
+    variant: Variant,
+    config: PriorConfig,
+) -> Float[Array, " q"]:
+    """The distances at `queries` that the code of a cloud says."""
+    real = jnp.ones(len(cloud), bool)
+    points, mask = farthest_points(cloud, real, config.encoder.points)
+    code = encode_ordered(Prior(params=dict(weights), config=config), points, mask)
+    return in_blocks(partial(distances, config, variant, weights, code), queries)
 
 
-def scores_of(
-    field: Any, near: Float[Array, "q 4"], uniform: Float[Array, "u 4"], name: str
-) -> dict[str, Array]:
-    """Share of right signs, intersection over union and, of a distance, its mean error."""
-    value, inside, truth = field(near[:, :3]), field(uniform[:, :3]) < 0, uniform[:, 3] < 0
-    scores = {
-        "sign": ((value < 0) == (near[:, 3] < 0)).mean(),
-        "iou": (inside & truth).sum() / jnp.maximum((inside | truth).sum(), 1),
+def field_scores(
+    near: Float[np.ndarray, " n"],
+    near_truth: Float[np.ndarray, " n"],
+    uniform: Float[np.ndarray, " u"],
+    uniform_truth: Float[np.ndarray, " u"],
+) -> dict[str, float | None]:
+    """Mean error of distances at both kinds of queries, share of right signs near the surface, and overlap."""
+    return {
+        "uniform": float(np.abs(uniform - uniform_truth).mean()),
+        "near": float(np.abs(near - near_truth).mean()),
+        "sign": float(((near < 0) == (near_truth < 0)).mean()),
+        "iou": volume_iou(uniform < 0, uniform_truth < 0),
     }
-    if name == OWN or VARIANTS[name].learns == "distance":
-        scores["error"] = jnp.abs(value - near[:, 3]).mean()
-    return scores
 
 
-def write(out: Path, settings: dict[str, Any], records: dict[str, list[Record]]) -> None:
+def mesh_chamfer(values: Grid, lattice: Lattice, surface: Float[np.ndarray, "p 3"]) -> float | None:
+    """Chamfer-L1 between points of the zero level, closed at the box, and the true ones; None if there is no level."""
+    if not (values < 0).any() or not (values > 0).any():
+        return None
+    padded = np.pad(values, 1, constant_values=max(float(values.max()), lattice.step))
+    vertices, faces, _, _ = marching_cubes(padded, 0.0, gradient_direction="descent")
+    mesh = trimesh.Trimesh(lattice.at(vertices - 1), faces, process=False)
+    return chamfer(surface_points(mesh, SAMPLES), surface)
+
+
+def chamfer(one: Float[np.ndarray, "n 3"], other: Float[np.ndarray, "m 3"]) -> float:
+    """(accuracy + completeness) / 2: mean distances to the nearest point of the other cloud."""
+    return float(KDTree(other).query(one)[0].mean() + KDTree(one).query(other)[0].mean()) / 2
+
+
+def write(folder: RunFolder) -> None:
     """results.json and tables, as the other programs leave them; prints the main one."""
-    out.mkdir(parents=True, exist_ok=True)
-    rows = rows_of(FIGURES, records, ("category",))
+    records, settings = folder.records(), folder.settings
+    rows = rows_of(FIGURES, records)
     content = circumstances_now() | {"scenes_asked": len(records), "settings": settings}
-    write_json(out / "results.json", content | {"rows": [dataclasses.asdict(r) for r in rows]})
+    write_json(folder.out / "results.json", content | {"rows": [dataclasses.asdict(r) for r in rows]})
     title = f"decoding, {settings['data']['regime']}"
-    (out / "tables.md").write_text(markdown(rows, title), encoding="utf-8")
-    (out / "tables.tex").write_text(latex(rows, title), encoding="utf-8")
-    Console().print(on_screen([r for r in rows if r.group == "all"], title))
+    (folder.out / "tables.md").write_text(markdown(rows, title), encoding="utf-8")
+    (folder.out / "tables.tex").write_text(latex(rows, title), encoding="utf-8")
+    Console().print(on_screen(rows, title))
 
 
 if __name__ == "__main__":

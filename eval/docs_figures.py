@@ -79,6 +79,9 @@ FIGURES = {
     "moments": ("moments", ""),
     "right moments": ("right moments", ""),
     "sign": ("sign", ""),
+    "L1 of uniform queries": ("L1 of uniform queries", ""),
+    "L1 near the surface": ("L1 near the surface", ""),
+    "Chamfer-L1 at the observed level": ("Chamfer-L1 at the observed level", ""),
     "error of distances": ("error of distances", ""),
     "overlap": ("overlap", ""),
     "orientation": ("orientation", ""),
@@ -96,7 +99,7 @@ COLLECTION = re.compile(r"collection \w+")  # groups that are kept beside them
 SENSE = {"higher": 1.0, "lower": -1.0}
 # What programs count, where it is not pairs.
 COUNTED = {"reconstruction": "objects", "segmentation": "objects"}
-NO_RIVALS = ("bfloat16", "building", "survival")  # programs whose lines are not methods
+NO_RIVALS = ("bfloat16", "building", "decoding", "survival")  # programs whose lines are not methods
 
 
 def main(keep: Path | None = None, name: str = "", docs: Path = DOCS) -> None:

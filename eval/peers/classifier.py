@@ -21,7 +21,6 @@ from rich.console import Console
 from rich.progress import track
 
 from eval.harness.batched import embed_all
-from eval.peers.learned_decoders import drawn
 from eval.peers.matching import Matched, Matcher, assigned
 from more2_jax.config import PriorConfig, load_config
 from more2_jax.network.prior import Prior, encode_ordered, load_prior, save_prior
@@ -31,8 +30,8 @@ from train.run.schedule import learning_rate
 from train.run.settings import TrainingConfig, TrainingRun
 from train.run.shape_mix import load_mix, open_mix
 from train.run.start import started_cold
-from train.shards.sampling import TrainingSample
-from train.shards.shards import open_shards
+from train.shards.sampling import TrainingSample, sample_batch
+from train.shards.shards import Shapes, open_shards
 
 NAME = "VN-DGCNN, trained on categories"
 
@@ -73,6 +72,16 @@ def categories(sources: Sequence[Path]) -> tuple[list[str], Int[np.ndarray, " sh
     given = [m["category"] for s in sources for m in open_shards(s, "train").meta]
     names = sorted(set(given))
     return names, np.array([names.index(c) for c in given])
+
+
+@partial(jax.jit, static_argnames=("config", "points"))
+def drawn(
+    shapes: Shapes, rows: Int[Array, " r"], number: Int[Array, ""], *, config: TrainingConfig, points: int
+) -> tuple[TrainingSample, Int[Array, " b"]]:
+    """The batch of a step, and which shapes it is of: functions of (seed, number) alone."""
+    index_key, sample_key = jax.random.split(jax.random.fold_in(jax.random.key(config.seed), number))
+    index = rows[jax.random.randint(index_key, (config.batch,), 0, len(rows))]
+    return sample_batch(sample_key, shapes, index, config, points), index
 
 
 def optimizer(config: TrainingConfig) -> optax.GradientTransformation:

@@ -1,6 +1,4 @@
-"""Decoders of the decoding study and the classifier: laws of turning, and both programs from shards to figures."""
-
-import json
+"""Decoders of the decoding study turn along with their objects; the classifier, from shards to matches."""
 
 import jax
 import jax.numpy as jnp
@@ -10,12 +8,11 @@ from known_scenes import known_scene
 from scipy.spatial.transform import Rotation
 from sphere_shards import sphere_shards
 
-from eval import decoding
 from eval.peers import classifier
-from eval.peers.learned_decoders import VARIANTS, decoder_of, frame_of, loss_of, start
-from more2_jax.network.prior import load_prior, save_prior
+from eval.peers.decoder_training import decoder_weights, distances
+from eval.peers.learned_decoders import VARIANTS, frame_of
+from more2_jax.network.prior import load_prior
 from more2_jax.types import Embedding
-from train.run.settings import TrainingConfig
 
 SMALL = """
 model:
@@ -67,58 +64,12 @@ def test_values_do_not_change_when_object_and_queries_turn(name, tiny_prior):
     e = code(tiny_prior.config.encoder.code)
     R = Rotation.random(random_state=3).as_matrix()
     points = np.random.default_rng(1).normal(size=(20, 3)).astype(np.float32)
-    weights, decoder = start(tiny_prior, e, 0)[name], decoder_of(tiny_prior, VARIANTS[name])
-    here = np.asarray(decoder.apply(weights, e, points))
-    there = np.asarray(decoder.apply(weights, turned(e, R), (points @ R.T).astype(np.float32)))
+    config, variant = tiny_prior.config, VARIANTS[name]
+    weights = {"decoder": decoder_weights(config, variant, e, 0)}
+    here = np.asarray(distances(config, variant, weights, e, points))
+    there = np.asarray(distances(config, variant, weights, turned(e, R), (points @ R.T).astype(np.float32)))
     np.testing.assert_allclose(there, here, atol=2e-4 * max(1, np.abs(here).max()))
     assert np.ptp(here) > 0
-
-
-def test_losses_are_least_where_they_should_be():
-    truth = jnp.array([[-0.2, 0.3]])
-    distance, occupancy = VARIANTS["inner, MLP"], VARIANTS["VN-ONet (inner, MLP, occupancy)"]
-    assert float(loss_of(distance, truth, truth, TrainingConfig())) == 0
-    sure, wrong = (
-        float(loss_of(occupancy, s * 30 * jnp.sign(truth), truth, TrainingConfig())) for s in (1, -1)
-    )
-    assert sure < 1e-6 and wrong > 20
-
-
-@pytest.mark.slow
-def test_decoders_are_trained_and_scored(tmp_path, tiny_prior):
-    (tmp_path / "shards").mkdir()
-    shards = sphere_shards(tmp_path / "shards")
-    save_prior(tiny_prior, tmp_path / "tiny.npz")
-    (tmp_path / "small.yaml").write_text(SMALL)
-    decoding.main(
-        (shards,),
-        tmp_path / "out",
-        prior=str(tmp_path / "tiny.npz"),
-        config=tmp_path / "small.yaml",
-        steps=2,
-        views=(1,),
-        split="val",
-        points=100,
-        most=3,
-    )
-    rows = json.loads((tmp_path / "out" / "1_views" / "results.json").read_text())["rows"]
-    overall = {(r["method"], r["name"]): r for r in rows if r["group"] == "all"}
-    assert {m for m, _ in overall} == {*VARIANTS, decoding.OWN}
-    assert all(r["count"] == 3 and 0 <= r["value"] <= 100 for r in overall.values() if r["unit"] == "%")
-    assert not any(m.startswith("VN-ONet") and n.startswith("error") for m, n in overall)
-
-
-def test_a_perfect_field_scores_one_and_its_negative_zero():
-    near = np.random.default_rng(0).normal(size=(50, 4)).astype(np.float32)
-    truth = dict(zip(map(tuple, near[:, :3].tolist()), near[:, 3].tolist(), strict=True))
-
-    def field(points):
-        return jnp.array([truth[tuple(p)] for p in np.asarray(points).tolist()])
-
-    right = decoding.scores_of(field, near, near, decoding.OWN)
-    assert (float(right["sign"]), float(right["iou"]), float(right["error"])) == (1, 1, 0)
-    wrong = decoding.scores_of(lambda p: -field(p), near, near, decoding.OWN)
-    assert (float(wrong["sign"]), float(wrong["iou"])) == (0, 0) and float(wrong["error"]) > 0
 
 
 @pytest.mark.slow

@@ -92,18 +92,22 @@ def training_step(
         prior = Prior(params=state.params | params, config=model)
         return total_loss(prior, sample, config, dropout_key, mesh)
 
+    gradient, terms = jax.grad(loss, has_aux=True)(trained(state.params, config))
+    return moved(state, gradient, config), terms | {"gradient": optax.global_norm(gradient)}
+
+
+def moved(state: TrainingState, gradient: dict[str, Any], config: TrainingConfig) -> TrainingState:
+    """The state after one step of Adam along a gradient of the weights that steps change."""
     before, average = trained(state.params, config), trained(state.average, config)
-    gradient, terms = jax.grad(loss, has_aux=True)(before)
     updates, opt_state = optimizer(config).update(gradient, state.optimizer, before)
     params: dict[str, Any] = optax.apply_updates(before, updates)  # pyright: ignore[reportAssignmentType]
     # Early on the average follows quickly, or it would remember the random start for long.
     keep = jnp.minimum(config.ema, (1 + state.step) / (10 + state.step))
     average = jax.tree.map(lambda old, new: keep * old + (1 - keep) * new, average, params)
-    terms = terms | {"gradient": optax.global_norm(gradient)}
     return dataclasses.replace(
         state,
         params=state.params | params,
         average=state.average | average,
         optimizer=opt_state,
         step=state.step + 1,
-    ), terms
+    )
