@@ -83,5 +83,5 @@ def as_sure(repair: Repair, chance: Mapping[str, float]) -> Repair:
     """
     if repair.divided is None and not repair.unmasked:
         return repair
-    resting = [chance[id_] for id_ in (repair.object, repair.divided) if id_ in chance]
+    resting = [p for id_, p in chance.items() if id_ in (repair.object, repair.divided)]
     return replace(repair, share=min(resting, default=repair.share))
