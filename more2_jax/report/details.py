@@ -40,10 +40,8 @@ def is_large(scene: LivingScene) -> bool:
 def report_details(scene: LivingScene) -> Iterator[tuple[str, str]]:
     """Name and text of every file of `DETAILS`, one at a time; none for a scene that its page holds alone."""
     if is_large(scene):
-        for k, o in enumerate(
-            scene.objects
-        ):  # by place, for an id read from a file need not be a name of one
-            yield f"{k}.js", _script(o)
+        for k, o in enumerate(scene.objects):
+            yield f"{k}.js", _script(o)  # by place: an id that was read from a file need not do for a name
 
 
 def write_details(folder: Path, details: Iterable[tuple[str, str]]) -> None:
