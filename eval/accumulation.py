@@ -95,23 +95,29 @@ def scene_records(
 ) -> list[Record]:
     """One record for every object of the first scan and every number of scans."""
     records: list[Record] = []
-    for k, tracks in enumerate(tracks_after_every_scan(scene, prior, config)):
+    for k, (tracks, reason) in enumerate(tracks_after_every_scan(scene, prior, config)):
         for o in scene.objects:
             if o.instance.get(0, LOST) != LOST and o.mesh is not None:
                 track = track_with(tracks, 0, o.instance[0])
-                records.append({"scans": k + 1, **object_record(scene, o, track, k, right_deg, samples)})
+                found = object_record(scene, o, track, k, right_deg, samples)
+                records.append({"scans": k + 1, "reason": reason, **found})
     return records
 
 
-def tracks_after_every_scan(scene: KnownScene, prior: Prior, config: SceneConfig) -> Iterator[list[Track]]:
-    """What the method holds after each scan: nothing from a scan on that it cannot use, as one without any mask."""
-    told = 0
-    try:
-        for living in living_scenes(scene, prior, config):
-            yield tracks_of(reconstruct(prior, living, config))
-            told += 1
-    except ValueError:
-        yield from ([] for _ in range(told, len(scene.scans)))
+def tracks_after_every_scan(
+    scene: KnownScene, prior: Prior, config: SceneConfig
+) -> Iterator[tuple[list[Track], str]]:
+    """What the method holds after each scan, and in words why it holds nothing.
+
+    That is so from a scan on that it cannot use, as one without any mask: the method has failed on the rest.
+    """
+    scenes, reason = living_scenes(scene, prior, config), ""
+    for _ in scene.scans:
+        try:
+            living = None if reason else next(scenes)
+        except ValueError as error:
+            living, reason = None, str(error)
+        yield [] if living is None else tracks_of(reconstruct(prior, living, config)), reason
 
 
 def object_record(

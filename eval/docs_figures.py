@@ -23,6 +23,7 @@ from typing import Any
 
 from eval.docs_chart import draw
 from eval.harness.options import OURS
+from eval.scores.told_chances import FIGURES as CHANCES
 from train.run.program import run
 
 DOCS = Path("docs")
@@ -36,8 +37,7 @@ FIGURES = {
     "F1": ("added and removed, F1", ""),
     "told as changed without a mask": ("told as changed without a mask", ""),
     "told whether it moved": ("told whether it moved", "strict"),
-    "calibration error of matches": ("calibration error of matches", ""),
-    "calibration error of changes": ("calibration error of changes", ""),
+    **{f.name: (f.name, "") for f in CHANCES},
     "t-mAP": ("t-mAP", ""),
     "t-AP50": ("t-AP50", ""),
     "median RE": ("MedRE of true pairs", "strict"),

@@ -28,7 +28,8 @@ from eval.performance.stopwatch import clock, told
 from eval.scores.figures import Figure, Record, in_columns
 from eval.scores.mended_masks import with_added_masks, with_divided_masks
 from eval.scores.temporal_ap import temporal_records
-from eval.scores.told_chances import CHANGES, MATCHES, told_chances
+from eval.scores.told_chances import FIGURES as CHANCES
+from eval.scores.told_chances import told_chances
 from eval.scores.tracks import Track, changes_f1, false_changes, score_tracks, tracks_of
 from more2_jax.config import EvidenceMatcher, SceneConfig
 from more2_jax.network.on_devices import at_hand
@@ -67,8 +68,7 @@ def figures() -> list[Figure]:
         replace(share, name="told whether it moved", key="told.strict", column="strict"),
         replace(share, name="added and removed, F1", key="changes_f1", statistic="mean"),
         replace(share, name="told as changed without a mask", key="false_change", better="lower"),
-        MATCHES,
-        CHANGES,
+        *CHANCES,
         *(replace(share, name=n, key=k, statistic="average_precision") for n, k in TEMPORAL.items()),
         time,
         replace(time, name="processor time a scene", key="cpu_seconds"),

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 from eval.data.truth import KnownScene
 from eval.scores.figures import Figure, Record
 from eval.scores.tracks import Track, said_changes, sides
 
+KINDS = ("matches", "changes")
 MATCHES, CHANGES = (
     Figure(
         name=f"calibration error of {kind}",
@@ -18,8 +20,19 @@ MATCHES, CHANGES = (
         scale=100,
         better="lower",
     )
-    for kind in ("matches", "changes")
+    for kind in KINDS
 )
+SHARE = Figure(name="", key="", statistic="mean", unit="%", scale=100)
+# What is told of matches and changes, and how it is: means, and how far apart they are by what is told.
+FIGURES = [
+    figure
+    for error in (MATCHES, CHANGES)
+    for figure in (
+        replace(SHARE, name=error.name.replace("calibration error", "told probability"), key=error.key),
+        replace(SHARE, name=error.name.replace("calibration error", "true share"), key=error.over),
+        error,
+    )
+]
 
 
 def told_chances(scene: KnownScene, tracks: Sequence[Track]) -> list[Record]:

@@ -239,7 +239,17 @@ def test_a_scan_that_cannot_be_used_ends_what_accumulates(published, monkeypatch
     monkeypatch.setattr(accumulation, "reconstruct", lambda prior, living, config: living)
     monkeypatch.setattr(accumulation, "tracks_of", lambda living: [living])
     scene = threerscan(published, split="validation", predicted=True).read("ref")
-    assert list(accumulation.tracks_after_every_scan(scene, None, None)) == [["after one scan"], []]
+    found = list(accumulation.tracks_after_every_scan(scene, None, None))
+    assert found == [(["after one scan"], ""), ([], "no instances")]
+
+    def fails(prior, living, config):
+        raise ValueError("a mistake of ours")
+
+    monkeypatch.setattr(
+        accumulation, "reconstruct", fails
+    )  # what is no scan's fault is no failure of the method
+    with pytest.raises(ValueError, match="a mistake of ours"):
+        list(accumulation.tracks_after_every_scan(scene, None, None))
 
 
 def test_masks_of_the_vertices_are_compared_on_the_vertices(published):

@@ -70,7 +70,8 @@ def test_killed_as_the_disk_changes_and_at_a_random_moment(place, here, command)
         process.join(after_s)
         process.kill()
         process.join(SECONDS)
-        assert survival.wrong_after(command, scenes, expected, lambda: here(words)) == ""
+        when = f"killed at change {at}, or after {after_s:.3f} s"
+        assert survival.wrong_after(command, scenes, expected, lambda: here(words)) == "", when
         return process.exitcode, told
 
     began = time.perf_counter()

@@ -7,7 +7,7 @@ import pytest
 from known_scenes import known_scene
 
 from eval.scores.figures import rows_of
-from eval.scores.told_chances import CHANGES, MATCHES, changes_told, matches_told, told_chances
+from eval.scores.told_chances import CHANGES, FIGURES, MATCHES, changes_told, matches_told, told_chances
 from eval.scores.tracks import Track
 
 SCENE = known_scene(copies=("a", "b", "b", "c"), scans=2)
@@ -71,3 +71,6 @@ def test_the_figure_is_the_gap_between_what_is_said_and_what_is_so():
     (row,) = rows_of([MATCHES], {"room": certain, "other": certain})
     assert row.value == pytest.approx(0.0) and row.ci95 == pytest.approx((0.0, 0.0))
     assert rows_of([CHANGES], {"room": records}) == []
+    means = {r.name: r.value for r in rows_of(FIGURES, {"room": records})}
+    assert means["told probability of matches"] == pytest.approx(100 * (2 * 0.95 + 0.45) / 3)
+    assert means["true share of matches"] == pytest.approx(100 * 2 / 3)
