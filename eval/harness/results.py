@@ -94,7 +94,8 @@ def words_of(o: Options, program: str) -> list[str]:
     words = ["python", "-m", f"eval.{program}"]
     for f in dataclasses.fields(o):
         value, flag = getattr(o, f.name), f.name.replace("_", "-")
-        if value == f.default or f.name == "fresh":
+        default = f.default if f.default_factory is dataclasses.MISSING else f.default_factory()
+        if value == default or f.name == "fresh":
             continue
         if isinstance(value, bool):
             words.append(f"--{flag}" if value else f"--no-{flag}")

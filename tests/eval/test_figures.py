@@ -163,5 +163,12 @@ def test_the_command_of_a_run_is_read_back_as_its_options():
     )
     words = words_of(asked, "registration")
     assert words[:3] == ["python", "-m", "eval.registration"]
+    assert {w for w in words if w.startswith("--")} == {
+        "--data",
+        "--out",
+        "--scenes",
+        "--no-peers",
+        "--preset",
+    }
     assert tyro.cli(registration.Settings, args=words[3:]) == dataclasses.replace(asked, fresh=False)
     assert portable(["--data", "/far/away/rooms", "3"]) == "--data rooms 3"
