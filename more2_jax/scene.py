@@ -183,7 +183,7 @@ def added(
     found = identified.found
     with stage("register", len(found)):
         views = Views(whole.objects, scene.scans, whole.instances, level, remembered(level.background))
-        seen, frame = relocalize(prior, views, old, new, identified, index, config)
+        seen, frame = relocalize(prior, views, old, new, identified, index, config, rooms_of(scene, level))
     codes, identified, views, old, new = [o.embedding for o in new], identified.without_pairs(), None, (), ()
     pairs = [(f.object, f.instance) for f in found if config.repair_masks]
     mended = mend_splits(whole.objects, whole.instances, pairs, seen[: len(pairs)])

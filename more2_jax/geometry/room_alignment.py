@@ -120,6 +120,11 @@ def fit_as_given(a: RoomShape, b: RoomShape) -> RoomFit | None:
     return given if given.share >= FITS else None
 
 
+def closeness(a: RoomShape, b: RoomShape, T_a_b: Pose) -> float:
+    """How closely the scans lie on one another at a pose, as `RoomFit.closeness`."""
+    return _fit(a, b, T_a_b, ()).closeness
+
+
 def fit_from_any_yaw(a: RoomShape, b: RoomShape) -> RoomFit | None:
     """`T_a_b` of scans whose z is up to about 10°, and whose floors are seen, wherever they lie.
 

@@ -18,6 +18,7 @@ from more2_jax.network.prior import Prior, field_sdf, object_field
 from more2_jax.types import Embedding, Sampled, Sight
 
 Inverse = Callable[[jaxlie.SE3], jaxlie.SE3]
+Distances = tuple[float | Float[Array, ""], ...]
 
 # Chosen on validation rooms (docs/developing/notebook/registration_parts.md).
 POINT_SHARE = 0.4  # of the distance to the nearest point, in a misfit; the rest is that off its surface
@@ -29,7 +30,7 @@ APART_DEG = 25.0  # poses kept by a search differ by at least this
 
 
 def misfits_both_ways(
-    T: jaxlie.SE3, source: Surface, target: Surface, truncations: tuple[float, ...]
+    T: jaxlie.SE3, source: Surface, target: Surface, truncations: Distances
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """Mean truncated distance of the source's points and of the target's, as shares of the truncation.
 
@@ -54,9 +55,7 @@ def misfits_both_ways(
     return mean(shares[:count], real[:count]), mean(shares[count:], real[count:])
 
 
-def misfit(
-    T: jaxlie.SE3, source: Surface, target: Surface, truncations: tuple[float, ...]
-) -> Float[Array, ""]:
+def misfit(T: jaxlie.SE3, source: Surface, target: Surface, truncations: Distances) -> Float[Array, ""]:
     """Mean truncated distance both ways, as a share of the truncation; 1 if the pose is not finite."""
     there, back = misfits_both_ways(T, source, target, truncations)
     return (there + back) / 2

@@ -15,6 +15,7 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import jaxlie
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from more2_jax.config import MotionModel, SurfaceRegistration
@@ -52,8 +53,14 @@ STAYED_RATIO, STAYED_OFFSET = 1.1, 0.01
 # A center that is shifted by less, a share of the radius, has not moved; a turn by less may be an error; what a turn in
 # place must fit better than no motion.
 IN_PLACE, NOT_TURNED_DEG, TURNED_RATIO, TURNED_OFFSET = 0.25, 15.0, 1.2, 0.01
+# Distance from which points of what still stands are apart, whatever its size, and how much farther apart they may be
+# as it stands than in another pose (docs/developing/notebook/still_standing.md).
+STANDING_M, STANDING_RATIO = 0.03, 1.3
 FINE = 0.25  # share of the truncation: the nearer one by which refined poses are told apart
 TURNED_DEG = 15.0  # competing poses differ by more
+
+# "It did not move", and whether both scans show surfaces where the other has the object.
+Stayed = tuple[jaxlie.SE3, Bool[Array | np.ndarray, "*batch"]]
 
 
 def register_by_surfaces(
@@ -66,14 +73,15 @@ def register_by_surfaces(
     candidates = pairs.candidates
     if candidates is None:
         candidates = search_poses(source, target, pairs.stayed, settings.search, motion).poses
-    return refine_poses(prior, (source, target), candidates, pairs.stayed, settings, motion)
+    standing = jnp.zeros(len(pairs), bool) if pairs.standing is None else pairs.standing
+    return refine_poses(prior, (source, target), candidates, (pairs.stayed, standing), settings, motion)
 
 
 def refine_poses(
     prior: Prior,
     objects: tuple[AlignableObject, AlignableObject],
     candidates: jaxlie.SE3,
-    stayed: jaxlie.SE3,
+    stayed: Stayed,
     settings: SurfaceRegistration,
     motion: MotionModel,
 ) -> Registration:
@@ -86,12 +94,12 @@ def refine_poses(
 @full_precision
 def _refine_poses(
     prior: Prior,
-    pairs: tuple[AlignableObject, AlignableObject, jaxlie.SE3, jaxlie.SE3],
+    pairs: tuple[AlignableObject, AlignableObject, jaxlie.SE3, Stayed],
     settings: SurfaceRegistration,
     motion: MotionModel,
 ) -> Registration:
     def one(
-        source: AlignableObject, target: AlignableObject, candidates: jaxlie.SE3, stayed: jaxlie.SE3
+        source: AlignableObject, target: AlignableObject, candidates: jaxlie.SE3, stayed: Stayed
     ) -> Registration:
         return refine_pair(prior, source, target, candidates, stayed, settings, motion)
 
@@ -105,7 +113,7 @@ def refine_pair(
     source: AlignableObject,
     target: AlignableObject,
     candidates: jaxlie.SE3,
-    stayed: jaxlie.SE3,
+    held: Stayed,
     settings: SurfaceRegistration,
     motion: MotionModel,
 ) -> Registration:
@@ -116,7 +124,7 @@ def refine_pair(
     """
     radius = target.radius
     source, target = rescale(source, 1 / radius), rescale(target, 1 / radius)
-    starts, stayed = scaled_pose(candidates, 1 / radius), scaled_pose(stayed, 1 / radius)
+    starts, stayed = scaled_pose(candidates, 1 / radius), scaled_pose(held[0], 1 / radius)
     s, t = thinned(source.full(), settings.points), thinned(target.full(), settings.points)
     poses = refined(starts, stayed, s, t, settings, motion)
     misfits = jax.vmap(lambda T: misfit(T, s, t, truncations(settings)))(poses)
@@ -127,6 +135,8 @@ def refine_pair(
     doubt = prior_cost(prior, poses, costs, (source, target), settings)
     moved = motion_since(stayed, poses, masked_mean(s.sampled.points, s.sampled.mask))
     best, costs = decided(costs, doubt, moved, settings.try_stayed)
+    if settings.try_stayed:
+        best = where_it_stands(best, jnp.asarray(held[1]), poses, (s, t), STANDING_M / radius)
     T = jax.tree.map(lambda x: x[best], poses)
     T = aligned = polished(T, (source, target), misfits[best], settings, motion)
     if settings.try_stayed:  # what stayed is exactly where it was
@@ -247,6 +257,27 @@ def simplest(
     shift, turned = (x[best] for x in moved)
     same = (shift < IN_PLACE) & (turned <= jnp.deg2rad(NOT_TURNED_DEG))
     return jnp.where(same & (simply(costs[-1]) <= costs[best]), len(costs) - 1, best)
+
+
+def where_it_stands(
+    best: Array,
+    standing: Bool[Array, ""],
+    poses: jaxlie.SE3,
+    surfaces: tuple[Surface, Surface],
+    reach: Float[Array, ""],
+) -> Array:
+    """The chosen pose, or "it did not move" (the last) if both scans show surfaces there, and it is nearly as near.
+
+    Near by `reach`, not by a share of the radius: noise and drift do not shrink with the object, and what fits a small
+    thing closest may be no more than how noise lies in either scan.
+    """
+
+    def kept(best: Array) -> Array:
+        two = jax.tree.map(lambda x: jnp.stack([x[-1], x[best]]), poses)
+        here, there = jax.vmap(lambda T: misfit(T, *surfaces, (reach,)))(two)
+        return jnp.where(here <= STANDING_RATIO * there, len(poses.wxyz_xyz) - 1, best)
+
+    return jax.lax.cond(standing, kept, lambda best: best, best)
 
 
 def simply(cost: Float[Array, ""]) -> Float[Array, ""]:

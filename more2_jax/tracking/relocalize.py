@@ -8,7 +8,7 @@ from functools import lru_cache, partial
 
 import jax
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from more2_jax.config import EvidenceMatcher, SceneConfig, SurfaceRegistration
 from more2_jax.geometry.poses import Points, Pose, apply_pose, local_poses
@@ -18,7 +18,7 @@ from more2_jax.network.prior import Prior
 from more2_jax.registration.pair_batch import PairBatch, local_batch, pair_up
 from more2_jax.registration.pose_costs import asks_sensors
 from more2_jax.registration.register_pairs import register
-from more2_jax.tracking.identify import Found, Identified
+from more2_jax.tracking.identify import NO_ROOMS, Found, Identified
 from more2_jax.tracking.object_views import Views
 from more2_jax.tracking.objects import (
     accumulated_normals,
@@ -27,7 +27,9 @@ from more2_jax.tracking.objects import (
     place_of,
     seen_again,
 )
+from more2_jax.tracking.rooms import Rooms
 from more2_jax.tracking.scan_frame import settled_frame
+from more2_jax.tracking.still_standing import standing
 from more2_jax.types import Frame, Instance, Observation, ObservedObject, Registration, SceneObject, Sight
 
 Sides = tuple[list[ObservedObject], list[ObservedObject]]  # objects, and instances of a new scan
@@ -100,6 +102,7 @@ def relocalize(
     identified: Identified,
     scan: int,
     config: SceneConfig,
+    rooms: Rooms = NO_ROOMS,
 ) -> tuple[list[Observation], Frame]:
     """Registers all that was found, and settles the frame of the scan by what stayed in it: an observation each.
 
@@ -112,11 +115,12 @@ def relocalize(
     known = [o for o, _ in old]
     # Asked twice where the frame changes: what few pairs show is kept.
     sides = lru_cache(maxsize=1)(partial(with_views, known, new, config, views))
-    result, T_scene_scan, aligned = registered(prior, identified, sides, config, frame)
+    held = partial(still_held, known, new, found, rooms, config)
+    result, T_scene_scan, aligned = registered(prior, identified, sides, config, frame, held(frame))
     if isinstance(config.matching, EvidenceMatcher):
         frame = settled(views.objects, old, found, aligned, result, frame, new, config)
         if not np.array_equal(frame.T_scene_scan, identified.frame.T_scene_scan):
-            result, T_scene_scan, _ = registered(prior, identified, sides, config, frame)
+            result, T_scene_scan, _ = registered(prior, identified, sides, config, frame, held(frame))
     return [
         observation(
             result,
@@ -133,18 +137,35 @@ def relocalize(
     ], frame
 
 
+def still_held(
+    old: Sequence[ObservedObject],
+    new: Sequence[ObservedObject],
+    found: Sequence[Found],
+    rooms: Rooms,
+    config: SceneConfig,
+    frame: Frame,
+) -> Bool[np.ndarray, " p"]:
+    """Of the pairs found, which are `standing`, where registration asks whether things moved at all."""
+    method = config.registration
+    if not isinstance(method, SurfaceRegistration) or not method.try_stayed:
+        return np.zeros(len(found), bool)
+    known, shown = ([o.points for o in side] for side in (old, new))
+    return standing(known, shown, [(f.object, f.instance) for f in found], frame, rooms)
+
+
 def registered(
     prior: Prior,
     identified: Identified,
     sides: Callable[[tuple[Found, ...]], Sides],
     config: SceneConfig,
     frame: Frame,
+    held: Bool[np.ndarray, " q"],
 ) -> tuple[Registration, Float[np.ndarray, "p 4 4"], Float[np.ndarray, "p 4 4"]]:
     """All that was found registered, `frame` being the scan's; and the poses of instances in the scene's frame.
 
     Last the same poses aligned, where "it did not move" was taken as it is: else each would only confirm the frame.
     In batches of as many pairs as `config.memory_mb` holds. `sides`: objects and instances, some with what sensors saw
-    of them.
+    of them. `held`: of each whether it is `standing`.
     """
     found, parts = identified.found, list[tuple[Registration, np.ndarray, np.ndarray]]()
     at_once = min(PAIRS_AT_ONCE, max(1, config.memory_mb // PAIR_MB))
@@ -153,6 +174,10 @@ def registered(
         pairs = pairs_found(identified, *sides(some), some)
         if frame is not identified.frame:
             pairs = with_frame(pairs, frame.T_scene_scan)
+        if held[start : start + at_once].any():
+            rows = np.zeros(len(pairs), bool)
+            rows[: len(some)] = held[start : start + at_once]
+            pairs = dataclasses.replace(pairs, standing=rows)
         result = jax.device_get(register(prior, pairs, config.registration, config.motion))
         T, aligned = result.T_target_source, result.aligned
         parts.append((result, pairs.to_world(T), pairs.to_world(T if aligned is None else aligned)))

@@ -20,6 +20,8 @@ from more2_jax.tracking.rooms import Rooms
 from more2_jax.types import Frame
 
 OFF_M, OFF_DEG = 0.02, 0.5  # by which such frames are off, in the median: drift bends rooms
+CLEARLY_OFF_M = 2 * OFF_M  # a frame as given is off where rooms say so by more
+SOME = 100  # points of a scan
 ALONE = 5  # objects that agree on a frame at which the rooms do not fit; three did by chance
 ENOUGH = 2  # objects that agree outweigh how closely the rooms fit
 
@@ -34,7 +36,7 @@ def frame_by_rooms(rooms: Rooms, votes: Votes, motion: MotionModel, given: Pose)
         given: the frame that is taken if there is no other.
     """
     if not rooms.fits:
-        return None
+        return frame_near_given(rooms, votes, motion, given)
     T, as_given = most_likely(rooms.fits, votes), agreement(given, votes)[0]
     if T is None or agreement(T, votes)[0] < as_given:
         return None if as_given else Frame(T_scene_scan=given, unknown=True)
@@ -42,14 +44,32 @@ def frame_by_rooms(rooms: Rooms, votes: Votes, motion: MotionModel, given: Pose)
     return Frame(T_scene_scan=T, sigma_m=OFF_M, sigma_deg=OFF_DEG)
 
 
+def frame_near_given(rooms: Rooms, votes: Votes, motion: MotionModel, given: Pose) -> Frame | None:
+    """The frame of a scan that lies nearly as given, by some centimeters or degrees; None where it lies as given.
+
+    Scans of one recording that a tracker has laid on one another are off by more than fused rooms are.
+    """
+    fit = rooms.clearly_near_given()
+    if fit is None:
+        return None
+    T = upright(fit.T_a_b, rooms.scan, given) if motion == "upright" else fit.T_a_b
+    if apart_m(T, given, rooms.scan) < CLEARLY_OFF_M or agreement(T, votes)[0] < agreement(given, votes)[0]:
+        return None
+    return Frame(T_scene_scan=T, sigma_m=OFF_M, sigma_deg=OFF_DEG)
+
+
+def apart_m(T: Pose, other: Pose, points: Points) -> float:
+    """Mean distance between the places that two poses give to some points of a scan."""
+    some = points[:: max(1, len(points) // SOME)]
+    return float(np.linalg.norm(apply_pose(T, some) - apply_pose(other, some), axis=1).mean())
+
+
 def borne_out(T_scene_scan: Pose, rooms: Rooms, votes: Votes) -> bool:
     """Whether rooms, where they fit at some poses, fit at this one, or too many objects agree on it for chance."""
-    if not rooms.fits or agreement(T_scene_scan, votes)[0] >= ALONE:
+    fits = rooms.fits if rooms.near_given is None else [rooms.near_given]
+    if not fits or agreement(T_scene_scan, votes)[0] >= ALONE:
         return True
-    some = rooms.scan[:: max(1, len(rooms.scan) // 100)]
-    here = apply_pose(T_scene_scan, some)
-    apart_m = [np.linalg.norm(apply_pose(f.T_a_b, some) - here, axis=1).mean() for f in rooms.fits]
-    return bool(min(apart_m) < DIFFERENT_M)
+    return min(apart_m(f.T_a_b, T_scene_scan, rooms.scan) for f in fits) < DIFFERENT_M
 
 
 def most_likely(fits: Sequence[RoomFit], votes: Votes) -> Pose | None:

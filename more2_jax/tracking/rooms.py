@@ -9,7 +9,15 @@ from functools import cached_property
 import numpy as np
 
 from more2_jax.geometry.poses import Points, apply_pose
-from more2_jax.geometry.room_alignment import RoomFit, RoomShape, fit_as_given, fits_from_any_yaw, room_shape
+from more2_jax.geometry.room_alignment import (
+    CLEARLY,
+    RoomFit,
+    RoomShape,
+    closeness,
+    fit_as_given,
+    fits_from_any_yaw,
+    room_shape,
+)
 from more2_jax.tracking.looked_at import last_place
 from more2_jax.types import Instance, LivingScene, Scan, SceneObject
 
@@ -38,15 +46,29 @@ class Rooms:
         )
 
     @cached_property
-    def fits(self) -> list[RoomFit]:
-        """The poses of the scan at which the rooms fit; none where they do as they are given, or one shows too little.
+    def near_given(self) -> RoomFit | None:
+        """The pose near the one given at which the rooms fit; None where there is none, or one shows too little.
 
-        Whatever masks are joined and divided, these stay.
+        Whatever masks are joined and divided, this and `fits` stay.
         """
         a, b = self.shapes
-        if a is None or b is None or fit_as_given(a, b) is not None:
+        return None if a is None or b is None else fit_as_given(a, b)
+
+    @cached_property
+    def fits(self) -> list[RoomFit]:
+        """The poses of the scan at which the rooms fit; none where they do near the given one, or show too little."""
+        a, b = self.shapes
+        if a is None or b is None or self.near_given is not None:
             return []
         return fits_from_any_yaw(a, b)
+
+    def clearly_near_given(self) -> RoomFit | None:
+        """`near_given` where the rooms clearly fit better so than as they are given."""
+        a, b = self.shapes
+        fit = self.near_given
+        if a is None or b is None or fit is None:
+            return None
+        return fit if closeness(a, b, np.eye(4)) < CLEARLY * fit.closeness else None
 
 
 def shape_of(background: Points, clouds: Iterable[Points]) -> RoomShape | None:

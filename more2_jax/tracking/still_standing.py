@@ -7,10 +7,10 @@ Where something moved to, nothing stood before.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from more2_jax.geometry.poses import Points, Pose, apply_pose
 from more2_jax.matching.assignment import Chosen
@@ -21,9 +21,11 @@ from more2_jax.tracking.rooms import LEAST_BACKGROUND, Rooms
 from more2_jax.types import Frame
 
 # Chosen on rooms of regime `real` and `sparse`, and two real captures: docs/developing/notebook/still_standing.md.
-STANDS = 3.5  # log odds that a pair loses for each of the two that still stands where the other scan has it
-# Share of a cloud's points that lie on the other scan: half may lie on what was put there since.
-LEAST_STANDING = 0.75
+# Log odds that a pair loses for each of the two that still stands where the other scan has it: likely, and surely.
+STANDS, SURELY_STANDS = 3.5, 8.0
+# Shares of a cloud's points that then lie on the other scan: half may lie on what was put there since; what was turned
+# by 6 degrees or shifted by 5 cm shows less than the second in its old place.
+LEAST_STANDING, SURELY_STANDING = 0.75, 0.85
 POINTS = 1000  # of a cloud, or somewhat more, that tell whether it stands there
 
 
@@ -47,18 +49,51 @@ def lost_by_standing(
     moved = [n for n, (a, b) in clouds.items() if apart(a, b)]
     if not moved:
         return lost
-    remembered = spacing_of(rooms.scene) if len(rooms.scene) >= LEAST_BACKGROUND else 0.0
     # An object is looked for in the new scan, an instance in what was known before.
     scan = shown(rooms.scan, (o.points for o in new), T)
     before = shown(rooms.scene, (o.points for o in old), np.eye(4))
-    for side, (clouds_there, near_m) in enumerate(((scan, NEAR_M), (before, max(NEAR_M, remembered)))):
+    for side, (clouds_there, near_m) in enumerate(
+        ((scan, NEAR_M), (before, max(NEAR_M, remembered_spacing(rooms))))
+    ):
         other_color = of_other_color(aligned, side)
         but = [
             {other, *other_color[own]} for own, other in (pairs[n, [side, 1 - side]].tolist() for n in moved)
         ]
         shares = shares_still_there([clouds[n][side] for n in moved], clouds_there, near_m, but)
-        lost[moved] += STANDS * (np.array(shares) >= LEAST_STANDING)
+        share = np.array(shares)
+        lost[moved] += np.select(
+            [share >= SURELY_STANDING, share >= LEAST_STANDING], [SURELY_STANDS, STANDS], 0.0
+        )
     return lost
+
+
+def standing(
+    known: Sequence[Points],
+    new: Sequence[Points],
+    pairs: Sequence[tuple[int, int]],
+    frame: Frame,
+    rooms: Rooms,
+) -> Bool[np.ndarray, " q"]:
+    """Of pairs (object, instance), whether both scans show surfaces, of whatever, where the other has it.
+
+    `known`: clouds of objects (scene's frame); `new`: of instances (scan's frame). None is in a scan of unknown frame.
+    """
+    T = frame.T_scene_scan
+    if frame.unknown or not pairs:
+        return np.zeros(len(pairs), bool)
+    objects = [few(known[k], POINTS) for k, _ in pairs]
+    instances = [apply_pose(T, few(new[i], POINTS)) for _, i in pairs]
+    scan, before = shown(rooms.scan, new, T), shown(rooms.scene, known, np.eye(4))
+    shares = (
+        shares_still_there(objects, scan, NEAR_M),
+        shares_still_there(instances, before, max(NEAR_M, remembered_spacing(rooms))),
+    )
+    return np.min(shares, axis=0) >= SURELY_STANDING
+
+
+def remembered_spacing(rooms: Rooms) -> float:
+    """Between neighboring points of the scene's background; 0 of too few."""
+    return spacing_of(rooms.scene) if len(rooms.scene) >= LEAST_BACKGROUND else 0.0
 
 
 def shown(background: Points, objects: Iterable[Points], T_scene: Pose) -> Iterator[Points]:

@@ -33,13 +33,14 @@ def votes(T_scene_scan: list[np.ndarray], centers: np.ndarray) -> Votes:
     return Votes(T_scene_scan=np.stack(T_scene_scan)[:, None], center=centers, object=rows, instance=rows)
 
 
-def told(stayed: int, motion="upright", backgrounds=None, away=AWAY):
+def told(stayed: int, motion="upright", backgrounds=None, away=AWAY, given=None):
     """The frame of a scan in which `stayed` of three boxes say that they stayed, the others that they moved."""
     before, after = objects(0), [apply_pose(away, o) for o in objects(1)]
     rooms = backgrounds or (empty_room(SIDES_M, 0), apply_pose(away, empty_room(SIDES_M, 1)))
     moved = turn_z(1.0, np.zeros(3), np.array([0.7, 0.5, 0.0]))
     ways = [np.linalg.inv(away) @ (np.eye(4) if k < stayed else moved) for k in range(3)]
-    given = LIFTED if motion == "upright" else np.eye(4)
+    if given is None:
+        given = LIFTED if motion == "upright" else np.eye(4)
     centers = np.stack([o.mean(axis=0) for o in after])
     known = Rooms(
         scene=rooms[0],
@@ -72,6 +73,23 @@ def test_no_frame_is_told_where_no_object_stayed_or_rooms_are_not_seen_or_lie_as
     assert told(3, away=np.eye(4)) is None
     strays = np.concatenate([empty_room(SIDES_M, 0), [[500.0, 0, 0]]])
     assert told(3, backgrounds=(strays, empty_room(SIDES_M, 1))) is None
+
+
+@pytest.mark.parametrize("motion", ["upright", "free"])
+@pytest.mark.parametrize("stayed", [0, 3])
+def test_a_scan_that_lies_nearly_as_given_is_put_where_the_rooms_fit(motion, stayed):
+    away = turn_z(np.deg2rad(2.0), np.zeros(3), np.array([0.12, -0.05, 0.0]))
+    frame = told(stayed, motion, away=away, given=np.eye(4))
+    assert frame is not None and not frame.unknown
+    np.testing.assert_allclose(frame.T_scene_scan @ away, np.eye(4), atol=0.02)
+    assert frame.sigma_m == OFF_M
+
+
+def test_a_frame_as_given_is_kept_where_it_is_off_by_no_more_than_rooms_are_or_more_objects_agree_with_it():
+    assert told(3, away=turn_z(0.0, np.zeros(3), np.array([0.01, -0.01, 0.0])), given=np.eye(4)) is None
+    room, shifted = empty_room(SIDES_M, 0), empty_room(SIDES_M, 1) + [0.15, -0.1, 0.0]
+    assert told(3, backgrounds=(room, shifted), away=np.eye(4), given=np.eye(4)) is None
+    assert told(0, backgrounds=(room, shifted), away=np.eye(4), given=np.eye(4)) is not None
 
 
 def fit(T, closeness) -> RoomFit:
@@ -139,5 +157,8 @@ def test_a_vote_at_which_rooms_do_not_fit_needs_more_objects(T, count, expected)
     rooms = Rooms(scan=empty_room(SIDES_M, 1))
     vars(rooms)["fits"] = [fit(np.eye(4), 1.0), fit(HALF_TURN, 0.9)]  # as if worked out
     assert borne_out(T, rooms, votes([T] * count, centers)) is expected
+    near = Rooms(scan=empty_room(SIDES_M, 1))
+    vars(near)["near_given"] = fit(np.eye(4), 1.0)
+    assert borne_out(T, near, votes([T] * count, centers)) is expected
     vars(rooms)["fits"] = []  # rooms that say nothing contradict nothing
     assert borne_out(T, rooms, votes([T] * count, centers))
