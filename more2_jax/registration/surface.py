@@ -119,8 +119,7 @@ def refine_pair(
 ) -> Registration:
     """One pair: the best of its poses refined, its covariance, and the poses that explain the clouds as well.
 
-    Works in units of the target's radius. `loss` and `misfit` are the truncated distance. Differentiable, the
-    correspondences held.
+    In units of the target's radius. `loss` and `misfit`: truncated distance. Differentiable for held correspondences.
     """
     radius = target.radius
     source, target = rescale(source, 1 / radius), rescale(target, 1 / radius)
@@ -135,8 +134,7 @@ def refine_pair(
     doubt = prior_cost(prior, poses, costs, (source, target), settings)
     moved = motion_since(stayed, poses, masked_mean(s.sampled.points, s.sampled.mask))
     best, costs = decided(costs, doubt, moved, settings.try_stayed)
-    if settings.try_stayed:
-        best = where_it_stands(best, jnp.asarray(held[1]), poses, (s, t), STANDING_M / radius)
+    best = where_it_stands(best, held[1] & settings.try_stayed, poses, (s, t), STANDING_M / radius)
     T = jax.tree.map(lambda x: x[best], poses)
     T = aligned = polished(T, (source, target), misfits[best], settings, motion)
     if settings.try_stayed:  # what stayed is exactly where it was
@@ -261,7 +259,7 @@ def simplest(
 
 def where_it_stands(
     best: Array,
-    standing: Bool[Array, ""],
+    standing: Bool[Array | np.ndarray, ""],
     poses: jaxlie.SE3,
     surfaces: tuple[Surface, Surface],
     reach: Float[Array, ""],

@@ -113,8 +113,7 @@ def relocalize(
     if not found:
         return [], frame
     known = [o for o, _ in old]
-    # Asked twice where the frame changes: what few pairs show is kept.
-    sides = lru_cache(maxsize=1)(partial(with_views, known, new, config, views))
+    sides = lru_cache(maxsize=1)(partial(with_views, known, new, config, views))  # asked twice in a new frame
     held = partial(still_held, known, new, found, rooms, config)
     result, T_scene_scan, aligned = registered(prior, identified, sides, config, frame, held(frame))
     if isinstance(config.matching, EvidenceMatcher):
