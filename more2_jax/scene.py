@@ -25,7 +25,13 @@ from more2_jax.refinement.joint_of_objects import fit_objects
 from more2_jax.refinement.pose_graph_of_objects import refine_object_poses
 from more2_jax.registration.pose_costs import asks_sensors
 from more2_jax.tracking.accumulated import accumulated_objects, embed_accumulated, readable, with_refined
-from more2_jax.tracking.changes import changes_between, counted_alone, forgotten, not_seen_in
+from more2_jax.tracking.changes import (
+    changes_between,
+    counted_alone,
+    forgotten,
+    not_seen_in,
+    set_in_motion,
+)
 from more2_jax.tracking.comparison import Comparison
 from more2_jax.tracking.identify import Found, Identified, chances, identify, with_left_over
 from more2_jax.tracking.joined_masks import join_parts
@@ -214,12 +220,15 @@ def with_poses_refined(
     scans: Sequence[ScanRecord],
     config: SceneConfig,
 ) -> list[SceneObject]:
-    """Returns the objects, the poses of the `chosen` refined by how their observations fit one another."""
+    """Returns the objects, the poses of the `chosen` refined by how their observations fit one another.
+
+    What would then have moved between two scans, though it had not before, stays as it is.
+    """
     for start in range(0, len(chosen), CLOSED_AT_ONCE):
         some = chosen[start : start + CLOSED_AT_ONCE]
         several = list(accumulated_objects(objects, some, scans))
-        refined = refine_object_poses(prior, several, config)
-        objects = with_refined(objects, some, refined)
+        refined = with_refined(objects, some, refine_object_poses(prior, several, config))
+        objects = [o if set_in_motion(o, r, config) else r for o, r in zip(objects, refined, strict=True)]
         give_back(len(objects))
     return objects
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Collection, Mapping, Sequence, Sized
+from itertools import pairwise
 
 import numpy as np
 from scipy.special import ndtr
@@ -103,6 +104,17 @@ def counted_alone(
     last, not_seen = scans[-1].index, not_seen_in(scans)
     there = [o.observations[-1].scan > last or last_known(o, last, not_seen) is not None for o in objects]
     return sum(there[k] for k in missing) + len(fresh), sum(there) + len(fresh)
+
+
+def set_in_motion(before: SceneObject, after: SceneObject, config: SceneConfig) -> bool:
+    """Whether an object whose poses were refined seems to have moved between two observations, but did not before."""
+    if after is before:
+        return False
+    pairs = zip(pairwise(before.observations), pairwise(after.observations), strict=True)
+    return any(
+        moved_probability(before, *old, config) <= 0.5 < moved_probability(after, *new, config)
+        for old, new in pairs
+    )
 
 
 def moved_probability(o: SceneObject, before: Observation, after: Observation, config: SceneConfig) -> float:
