@@ -41,7 +41,7 @@ from more2_jax.tracking.mask_borders import mend_borders
 from more2_jax.tracking.merged_masks import divide_merged
 from more2_jax.tracking.object_views import Views
 from more2_jax.tracking.objects import SCENE_FRAME, accumulated, new_objects, next_number
-from more2_jax.tracking.regrouped import Regrouped
+from more2_jax.tracking.regrouped import Regrouped, as_sure_as_masks
 from more2_jax.tracking.relocalize import accumulated_rows, known_object, relocalize, with_observations
 from more2_jax.tracking.room_points import Cleared, remembered, without_room
 from more2_jax.tracking.rooms import rooms_of
@@ -134,7 +134,8 @@ def who_is_who(
             elif mend is without_unfound:
                 break
         masks, old, new, found = known
-        return masks, old, new, with_left_over(found, config, rooms).without_seen()
+        found = as_sure_as_masks(with_left_over(found, config, rooms), masks, config)
+        return masks, old, new, found.without_seen()
 
 
 def mends_of_masks(scene: LivingScene, scan: Scan) -> Iterator[Mend]:

@@ -12,7 +12,7 @@ from scipy import stats
 from scipy.special import logit
 
 from eval.scores.average_precision import ap_of_rows
-from eval.scores.reliability import calibration_error
+from eval.scores.reliability import calibration_error, error_by_chance
 
 Record = dict[str, Any]  # one pair, object or scan pair; None stands for a failure
 Column = Literal["paper", "published", "strict", ""]
@@ -31,11 +31,14 @@ class Figure:
     `ratio`: the sum of `key` over the sum of `over`.
     `average_precision`: of the predictions of all scenes together; `key` holds the `ap_rows` of one.
     `calibration`: the expected calibration error of probabilities (`key`) of what is so or not (`over`: 1 or 0).
+    `chance`: what that would be, by chance, if they were true.
     """
 
     name: str
     key: str
-    statistic: Literal["share", "at_least", "mean", "median", "ratio", "average_precision", "calibration"]
+    statistic: Literal[
+        "share", "at_least", "mean", "median", "ratio", "average_precision", "calibration", "chance"
+    ]
     column: Column = ""
     unit: str = ""
     better: Literal["higher", "lower"] = "higher"
@@ -127,6 +130,8 @@ def reduce(figure: Figure, rows: np.ndarray) -> float:
         return ap_of_rows(rows)
     if figure.statistic == "calibration":
         return calibration_error(logit(rows[:, 0]), rows[:, 1] > 0)
+    if figure.statistic == "chance":
+        return error_by_chance(logit(rows[:, 0]))
     if figure.statistic == "median":
         return _median(rows[:, 0], worst=np.inf if figure.better == "lower" else -np.inf)
     above, below = parts(figure, rows)
@@ -141,8 +146,8 @@ def _median(values: np.ndarray, worst: float) -> float:
 
 
 def interval(figure: Figure, arrays: Sequence[np.ndarray]) -> tuple[float, float] | None:
-    """95 % interval by resampling whole scenes; None of a single scene, or where a bound is a failure."""
-    if len(arrays) < 2:
+    """95 % interval by resampling whole scenes; None of one scene, of `chance`, or where a bound is a failure."""
+    if len(arrays) < 2 or figure.statistic == "chance":
         return None
     index = np.random.default_rng(0).integers(0, len(arrays), (DRAWS, len(arrays)))
     if figure.statistic in ("median", "average_precision", "calibration"):

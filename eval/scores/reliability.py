@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.special import expit
 
+DRAWS = 400  # of outcomes by chance
 BINS = 10  # of equal width, as in Guo et al., On Calibration of Modern Neural Networks, ICML 2017
 
 
@@ -42,3 +43,10 @@ def calibration_error(odds: Float[np.ndarray, " p"], one: Bool[np.ndarray, " p"]
     """Expected calibration error: mean difference of what is said and what is true over the bins of `reliability`."""
     curve = reliability(odds, one, bins)
     return sum(b.count * abs(b.said - b.true) for b in curve) / sum(b.count for b in curve)
+
+
+def error_by_chance(odds: Float[np.ndarray, " p"], bins: int = BINS) -> float:
+    """What `calibration_error` would be in the mean if the probabilities were true: of few, more than nothing."""
+    said = expit(odds)
+    drawn = np.random.default_rng(0).random((DRAWS, len(said))) < said
+    return float(np.mean([calibration_error(odds, one, bins) for one in drawn]))

@@ -1,4 +1,4 @@
-"""Whether the probabilities that a living scene tells hold: of its matches, and of what it says came or went."""
+"""Whether the probabilities that a living scene tells hold: of its matches, and of what came, went, moved or stayed."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from eval.data.truth import KnownScene
 from eval.scores.figures import Figure, Record
 from eval.scores.tracks import Track, said_changes, sides
 
-KINDS = ("matches", "changes")
-MATCHES, CHANGES = (
+KINDS = ("matches", "changes", "motions")
+MATCHES, CHANGES, MOTIONS = (
     Figure(
         name=f"calibration error of {kind}",
         key=f"said.{kind}",
@@ -26,18 +26,19 @@ SHARE = Figure(name="", key="", statistic="mean", unit="%", scale=100)
 # What is told of matches and changes, and how it is: means, and how far apart they are by what is told.
 FIGURES = [
     figure
-    for error in (MATCHES, CHANGES)
+    for error in (MATCHES, CHANGES, MOTIONS)
     for figure in (
         replace(SHARE, name=error.name.replace("calibration error", "told probability"), key=error.key),
         replace(SHARE, name=error.name.replace("calibration error", "true share"), key=error.over),
         error,
+        replace(error, name=f"{error.name}, by chance", statistic="chance"),
     )
 ]
 
 
 def told_chances(scene: KnownScene, tracks: Sequence[Track]) -> list[Record]:
-    """Of every match and change that is told with a probability: what is said, and whether it is so (1 or 0)."""
-    return [*matches_told(scene, tracks), *changes_told(scene, tracks)]
+    """Of every match, change and motion that is told with a probability: that, and whether it is so (1 or 0)."""
+    return [*matches_told(scene, tracks), *changes_told(scene, tracks), *motions_told(scene, tracks)]
 
 
 def matches_told(scene: KnownScene, tracks: Sequence[Track]) -> list[Record]:
@@ -63,4 +64,18 @@ def changes_told(scene: KnownScene, tracks: Sequence[Track]) -> list[Record]:
         shown = next((o for o in scene.objects if instance in o.masks(here)), None)
         if shown is not None and k in t.alone:
             found.append({CHANGES.key: t.alone[k], CHANGES.over: float(other not in shown.T_scan_model)})
+    return found
+
+
+def motions_told(scene: KnownScene, tracks: Sequence[Track]) -> list[Record]:
+    """Of right matches of the first scan and the next, where it is known whether the object moved."""
+    found = list[Record]()
+    for t in tracks:
+        first = min(t.instance)
+        k, before = first + 1, scene.owner(first, t.instance[first])
+        after = scene.owner(k, t.instance[k]) if k in t.instance else None
+        if k not in t.motion or before is None or after is None or before.copies != after.copies:
+            continue
+        if before.first == first and (moved := before.moved.get(k)) is not None:
+            found.append({MOTIONS.key: t.motion[k], MOTIONS.over: float(t.moved[k] == moved)})
     return found

@@ -35,8 +35,10 @@ class Track:
     not_seen: frozenset[int] = frozenset()  # scans of which it is said that they did not look for it
     # How probable it is said to be, by scan: that it is one object with the first, and
     matched: dict[int, float] = field(default_factory=dict)
-    # that of this scan and the one before, one alone has it.
+    # that of this scan and the one before, one alone has it,
     alone: dict[int, float] = field(default_factory=dict)
+    # that it moved, or stayed, as `moved` has it.
+    motion: dict[int, float] = field(default_factory=dict)
 
 
 def tracks_of(scene: LivingScene, *, probable: bool = False) -> list[Track]:
@@ -53,6 +55,11 @@ def tracks_of(scene: LivingScene, *, probable: bool = False) -> list[Track]:
             not_seen=frozenset(s.index for s in scene.scans if o.id in s.not_seen),
             matched={seen.scan: seen.score for seen in o.observations[1:] if probable},
             alone=in_one_scan(scene, o.id) if probable else {},
+            motion={
+                c.to_scan: c.probability[o.id]
+                for c in scene.changes
+                if probable and o.id in c.moved + c.static and o.id in c.probability
+            },
         )
         for o in scene.objects
     ]

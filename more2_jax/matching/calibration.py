@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
-from scipy.special import expit
+from scipy.special import expit, logit
 
 from more2_jax.config import MotionModel, SurfaceSearch
 from more2_jax.matching.pair_evidence import PairEvidence, asks_prior
@@ -80,6 +80,20 @@ FREE = Calibration(
 )
 # Without the prior's say.
 UNASKED = Calibration(intercept=3.7, likeness=5.8, apart_less=-6.3, apart_more=-6.1, raised=3.0)
+# Of log odds beyond an even chance, what remains in those that a match is told with:
+# docs/developing/notebook/told_probabilities.md.
+REMAINS = 0.5
+
+
+@dataclass(frozen=True, kw_only=True)
+class Told:
+    """How sure what an assignment took is told to be. It is likelier right than others of the same log odds."""
+
+    taken: float  # log odds of a pair that is one object or is not with an even chance
+    mended: float  # and where it rests on masks that were divided, or that are missing
+
+
+TOLD_UPRIGHT, TOLD_FREE = Told(taken=2.9, mended=-2.9), Told(taken=1.9, mended=-0.6)
 # Log odds that what one scan alone seems to have is not in the other, and what a share of further such things takes.
 ALONE, ALONE_LESS = 1.7, 6.2
 FEW_THINGS = 8  # as rooms have: of fewer, one more is no larger share
@@ -105,6 +119,20 @@ def probability(
 ) -> Float[np.ndarray, "*pairs"]:
     """Of pairs to be one object, by their log odds as `calibrated` has them."""
     return expit(odds - even_odds(search, motion))
+
+
+def told_probability(
+    odds: Float[np.ndarray, "*pairs"], search: SurfaceSearch, motion: MotionModel
+) -> Float[np.ndarray, "*pairs"]:
+    """Of pairs that an assignment took to be one object, by their log odds as `calibrated` has them."""
+    told = TOLD_UPRIGHT if motion == "upright" else TOLD_FREE
+    return expit(told.taken + REMAINS * (odds - even_odds(search, motion)))
+
+
+def mended_probability(told: float, motion: MotionModel) -> float:
+    """What `told_probability` has of a pair, where it rests on masks that were divided or are missing."""
+    less = (TOLD_UPRIGHT if motion == "upright" else TOLD_FREE).mended
+    return float(expit(logit(told) + less))
 
 
 def alone_probability(alone: int, things: int) -> float:

@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from more2_jax.config import CodeMatcher, EvidenceMatcher, SceneConfig
 from more2_jax.matching.assignment import Chosen, LogOdds, assign, interchangeable, unmatched
-from more2_jax.matching.calibration import alone_probability, even_odds, probability
+from more2_jax.matching.calibration import alone_probability, even_odds, probability, told_probability
 from more2_jax.matching.candidates import AlignedPairs, odds_of
 from more2_jax.matching.code_assignment import match_instances
 from more2_jax.matching.places import IN_PLACE, in_place, motion_odds
@@ -162,11 +162,12 @@ def as_told(odds: LogOdds, pairs: Chosen, known: Identified, config: SceneConfig
     """An assignment with its probabilities, of what is `known` of the scan."""
     assert isinstance(config.matching, EvidenceMatcher)
     copies = interchangeable(odds, pairs)
-    chance = probability(odds.value, config.matching.search, config.motion)
-    gone, fresh = unmatched(odds, chance, pairs)
+    how = config.matching.search, config.motion
+    gone, fresh = unmatched(odds, probability(odds.value, *how), pairs)
+    told = told_probability(odds.value[odds.rows_of(pairs)], *how)
     found = tuple(
         Found(object=int(k), instance=int(i), score=float(p), interchangeable=c)
-        for (k, i), p, c in zip(pairs, chance[odds.rows_of(pairs)], copies, strict=True)
+        for (k, i), p, c in zip(pairs, told, copies, strict=True)
     )
     return replace(known, found=found, gone=gone, new=fresh)
 

@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from more2_jax.tracking.identify import Found
+from more2_jax.config import EvidenceMatcher, SceneConfig
+from more2_jax.matching.calibration import mended_probability
+from more2_jax.tracking.identify import Found, Identified
 from more2_jax.types import Embedding, Instance, Repair, SceneObject
 
 
@@ -67,6 +69,16 @@ class Regrouped:
         """Those found of which a mask shows both the object and the instance."""
         return [f for f in found if not (self.is_unmasked(0, f.object) or self.is_unmasked(1, f.instance))]
 
+    def rests_on_mended(self, f: Found) -> bool:
+        """Whether a mask of the object or of the instance was divided, or is missing."""
+        divided = {id_ for r in self.repairs if r.divided for id_ in (r.object, r.divided)}
+        return (
+            self.is_unmasked(0, f.object)
+            or self.is_unmasked(1, f.instance)
+            or self.objects[f.object].id in divided
+            or any(f.instance in half for half in self.halves)
+        )
+
     def is_unmasked(self, side: int, row: int) -> bool:
         """Whether no mask shows an object (side 0) or instance (1)."""
         return row >= len((self.objects, self.instances)[side]) - self.unmasked[side]
@@ -74,6 +86,17 @@ class Regrouped:
     def unmasked_objects(self) -> list[SceneObject]:
         """The objects that no mask of the scan before shows."""
         return self.objects[len(self.objects) - self.unmasked[0] :]
+
+
+def as_sure_as_masks(identified: Identified, masks: Regrouped, config: SceneConfig) -> Identified:
+    """What was found of masks that were divided or are missing is less sure; where surfaces were compared."""
+    if not isinstance(config.matching, EvidenceMatcher):
+        return identified
+    found = (
+        replace(f, score=mended_probability(f.score, config.motion)) if masks.rests_on_mended(f) else f
+        for f in identified.found
+    )
+    return replace(identified, found=tuple(found))
 
 
 def as_sure(repair: Repair, chance: Mapping[str, float]) -> Repair:

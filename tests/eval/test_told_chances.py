@@ -7,7 +7,17 @@ import pytest
 from known_scenes import known_scene
 
 from eval.scores.figures import rows_of
-from eval.scores.told_chances import CHANGES, FIGURES, MATCHES, changes_told, matches_told, told_chances
+from eval.scores.reliability import calibration_error, error_by_chance
+from eval.scores.told_chances import (
+    CHANGES,
+    FIGURES,
+    MATCHES,
+    MOTIONS,
+    changes_told,
+    matches_told,
+    motions_told,
+    told_chances,
+)
 from eval.scores.tracks import Track
 
 SCENE = known_scene(copies=("a", "b", "b", "c"), scans=2)
@@ -74,3 +84,34 @@ def test_the_figure_is_the_gap_between_what_is_said_and_what_is_so():
     means = {r.name: r.value for r in rows_of(FIGURES, {"room": records})}
     assert means["told probability of matches"] == pytest.approx(100 * (2 * 0.95 + 0.45) / 3)
     assert means["true share of matches"] == pytest.approx(100 * 2 / 3)
+
+
+def moving(moved):
+    """The first object is known to have moved, or not; None: nobody knows."""
+    o = dataclasses.replace(SCENE.objects[0], moved={} if moved is None else {1: moved})
+    return dataclasses.replace(SCENE, objects=(o, *SCENE.objects[1:]))
+
+
+@pytest.mark.parametrize(
+    ("second", "moved", "so"),
+    [
+        (10, True, [1.0]),
+        (10, False, [0.0]),
+        (10, None, []),
+        (11, True, []),  # of another object nobody asks
+    ],
+)
+def test_a_motion_is_asked_of_right_matches_alone(second, moved, so):
+    said = [track(0, second, moved={1: True}, motion={1: 0.7})]
+    assert told(motions_told(moving(moved), said), MOTIONS) == [(0.7, x) for x in so]
+    assert motions_told(moving(moved), [track(0, second, moved={1: True})]) == []
+
+
+def test_few_true_probabilities_have_an_error_by_chance_that_many_have_not():
+    rng = np.random.default_rng(1)
+    few, many = rng.normal(0, 2, 40), rng.normal(0, 2, 20_000)
+    assert error_by_chance(few) > 0.05 > 0.02 > error_by_chance(many)
+    sure = np.full(50, 40.0)
+    assert error_by_chance(sure) == pytest.approx(0.0, abs=1e-9)
+    so = rng.random(len(many)) < 1 / (1 + np.exp(-many))
+    assert abs(calibration_error(many, so) - error_by_chance(many)) < 0.01

@@ -1,9 +1,11 @@
 """How sure what was mended of masks is said to be."""
 
+import pytest
 from factories import living_scene
 
-from more2_jax.tracking.identify import Found
-from more2_jax.tracking.regrouped import Regrouped, as_sure
+from more2_jax.config import preset
+from more2_jax.tracking.identify import Found, Identified
+from more2_jax.tracking.regrouped import Regrouped, as_sure, as_sure_as_masks
 from more2_jax.types import Instance, Repair
 
 SCENE = living_scene()
@@ -37,3 +39,32 @@ def test_repairs_of_objects_and_of_masks_rest_on_the_matches_of_the_scan():
     divided, missing = whole.all_repairs(found, {})
     assert (divided.divided, divided.share) == (SECOND, 0.8)
     assert (missing.object, missing.share) == (SCENE.objects[last].id, 0.7)
+
+
+@pytest.mark.parametrize(
+    ("changed", "expected"),
+    [
+        ({}, False),
+        ({"repairs": (Repair(object=FIRST, divided=SECOND),)}, True),
+        ({"repairs": (Repair(object=SECOND, divided=FIRST),)}, True),
+        ({"repairs": (Repair(object=FIRST, absorbed=(SECOND,)),)}, False),  # parts that were joined
+        ({"halves": ((0, 1),)}, True),
+        ({"halves": ((1, 2),)}, False),
+        ({"unmasked": (0, 1)}, True),
+        ({"unmasked": (len(SCENE.objects), 0)}, True),
+    ],
+)
+def test_what_rests_on_masks_that_were_divided_or_are_missing_is_less_sure(changed, expected):
+    whole = Regrouped(
+        objects=list(SCENE.objects),
+        instances=[Instance(id=4, points=SCENE.objects[0].points)],
+        embeddings=[SCENE.objects[0].embedding],
+        **changed,
+    )
+    told = Identified(found=(Found(object=0, instance=0, score=0.9),))
+    for upright in (True, False):
+        config = preset("robust", upright=upright)
+        (found,) = as_sure_as_masks(told, whole, config).found
+        assert (found.score < 0.85) is expected
+        assert expected or found.score == 0.9
+    assert as_sure_as_masks(told, whole, preset("paper")) is told
