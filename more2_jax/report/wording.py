@@ -15,7 +15,7 @@ from more2_jax.tracking.objects import motion_between, observation_in
 from more2_jax.tracking.pose_voting import turns_deg
 from more2_jax.types import Changes, LivingScene, Observation, Repair, ScanRecord, SceneObject
 
-LOW_SCORE = 0.3  # a match below it is told as unsure; same objects usually score 0.5 to 0.9
+LOW_SCORE = 0.5  # a match below it is told as unsure; same objects usually score 0.5 to 0.9
 UNLIKELY = 0.6  # as is a change that is less probable than this
 LEAST_TURN_DEG = 2.0  # of a scan's frame against the first one's that is worth telling
 

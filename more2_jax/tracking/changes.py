@@ -16,6 +16,7 @@ from more2_jax.types import Changes, LivingScene, Observation, ScanRecord, Scene
 # Registration takes correspondences as independent: true errors are larger than it says, by about this much.
 OPTIMISM = 3.0
 SURE = 2.0  # standard errors that a motion must exceed
+IN_DOUBT = 0.55  # that something moved between scans of which nobody knows how they lie: 11 of 17 things had
 
 KINDS = ("moved", "static", "added", "removed", "not_seen", "discovered")
 # Of a scan, the ids of objects that it cannot tell it lacks.
@@ -120,8 +121,11 @@ def set_in_motion(before: SceneObject, after: SceneObject, config: SceneConfig) 
 def moved_probability(o: SceneObject, before: Observation, after: Observation, config: SceneConfig) -> float:
     """That an object moved: by more than `static_m` or `static_deg`, and than registration's own error explains.
 
-    Measured motions are taken as normal about the true ones. Without an error (`paper`), 0 or 1.
+    Measured motions are taken as normal about the true ones. Without an error (`paper`), 0 or 1. In a scan of unknown
+    frame, no more than likely.
     """
+    if before.frame.unknown or after.frame.unknown:
+        return IN_DOUBT
     distance, angle_deg = motion_between(o, before, after)
     found = []
     for motion, limit, own in (

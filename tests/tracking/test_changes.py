@@ -1,11 +1,14 @@
 """What refinement makes of poses moves nothing that had not moved."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from factories import scene_object, turn_z
 
 from more2_jax.config import preset
-from more2_jax.tracking.changes import set_in_motion
+from more2_jax.tracking.changes import moved_probability, set_in_motion
+from more2_jax.types import Frame
 
 CONFIG = preset("robust", upright=True)
 
@@ -34,3 +37,18 @@ def test_only_what_had_not_moved_can_be_set_in_motion(before, after, expected):
 def test_an_object_that_is_as_it_was_is_not():
     o = seen_at(0.0)
     assert not set_in_motion(o, o, CONFIG)
+
+
+@pytest.mark.parametrize("shift_m", [0.0, 2.0])
+def test_what_moved_is_in_doubt_where_nobody_knows_how_a_scan_lies(shift_m):
+    o = seen_at(shift_m)
+    before, after = o.observations
+    known = moved_probability(o, before, after, CONFIG)
+    assert known < 0.05 or known > 0.95
+    for pair in ((before, lost(after)), (lost(before), after)):
+        assert 0.5 < moved_probability(o, *pair, CONFIG) < 0.6
+
+
+def lost(seen):
+    """The same in a scan of unknown frame."""
+    return dataclasses.replace(seen, frame=Frame(unknown=True))
