@@ -30,6 +30,7 @@ CONTINUES_M = 0.25  # so near the background's own points a plane goes on
 NEIGHBORS = 12  # of a point, itself among them: its normal
 TRIES, PLANES = 150, 8  # planes tried, at even steps; those found in turn, whether they bound the room or not
 BOX_SLACK = 1.001  # times a reach: a box that rounding takes nothing from
+THREADS = 4  # of a search in a tree: few, as scenes may be worked on side by side
 JUDGES = 1500  # points at even steps that choose among the planes tried
 
 
@@ -116,7 +117,7 @@ def is_wide(points: Points) -> bool:
 
 def goes_on(plane: RoomPlane, tree: KDTree) -> bool:
     """Whether a plane goes on where the cloud ends; the rest of a tabletop that was cut off does not."""
-    near = np.isfinite(tree.query(plane.points, distance_upper_bound=BEYOND_M)[0])
+    near = np.isfinite(tree.query(plane.points, distance_upper_bound=BEYOND_M, workers=THREADS)[0])
     return float((~near).mean()) >= LEAST_BEYOND
 
 
@@ -136,7 +137,7 @@ def within(tree: KDTree, points: Points | NearPoints, reach_m: float) -> Points:
         points = points.around_box(low, high)
     for axis in range(3):
         points = points[(points[:, axis] >= low[axis]) & (points[:, axis] <= high[axis])]
-    return points[np.isfinite(tree.query(points, distance_upper_bound=reach_m)[0])]
+    return points[np.isfinite(tree.query(points, distance_upper_bound=reach_m, workers=THREADS)[0])]
 
 
 def on_planes(
@@ -157,6 +158,8 @@ def on_planes(
 
 def across(points: Points, among: Points) -> Points:
     """Unit normals, of either sign, of the surface that a cloud has at some points, by their nearest neighbors."""
-    near = KDTree(among).query(points, k=min(NEIGHBORS, len(among)))[1].reshape(len(points), -1)
+    near = (
+        KDTree(among).query(points, k=min(NEIGHBORS, len(among)), workers=THREADS)[1].reshape(len(points), -1)
+    )
     centered = among[near] - among[near].mean(axis=1, keepdims=True)
     return np.linalg.eigh(np.einsum("nki,nkj->nij", centered, centered))[1][:, :, 0]

@@ -8,7 +8,7 @@ from functools import lru_cache, partial
 
 import jax
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float, Int
 
 from more2_jax.config import EvidenceMatcher, SceneConfig, SurfaceRegistration
 from more2_jax.geometry.poses import Points, Pose, apply_pose, local_poses
@@ -29,11 +29,13 @@ from more2_jax.tracking.objects import (
 )
 from more2_jax.tracking.rooms import Rooms
 from more2_jax.tracking.scan_frame import settled_frame
-from more2_jax.tracking.still_standing import standing
+from more2_jax.tracking.still_standing import apart, standing
 from more2_jax.types import Frame, Instance, Observation, ObservedObject, Registration, SceneObject, Sight
 
 Sides = tuple[list[ObservedObject], list[ObservedObject]]  # objects, and instances of a new scan
+Registered = tuple[Registration, Float[np.ndarray, "_ 4 4"], Float[np.ndarray, "_ 4 4"]]
 
+SAME = 1e-4  # of entries of a pose in meters: "it did not move", but for rounding
 PAIR_MB = 2  # of a pair ready to be registered: both clouds, codes, and what sensors saw (1.2 MB)
 PAIRS_AT_ONCE = 32  # at most, whatever memory there is: more are not faster
 # Of all that is known of an object: if a scan shows so much again, what else it shows belongs to it, however badly a
@@ -114,12 +116,15 @@ def relocalize(
         return [], frame
     known = [o for o, _ in old]
     sides = lru_cache(maxsize=1)(partial(with_views, known, new, config, views))  # asked twice in a new frame
-    held = partial(still_held, known, new, found, rooms, config)
-    result, T_scene_scan, aligned = registered(prior, identified, sides, config, frame, held(frame))
+    placed = registered(prior, identified, sides, config, frame)
     if isinstance(config.matching, EvidenceMatcher):
-        frame = settled(views.objects, old, found, aligned, result, frame, new, config)
+        frame = settled(views.objects, old, found, placed[2], placed[0], frame, new, config)
         if not np.array_equal(frame.T_scene_scan, identified.frame.T_scene_scan):
-            result, T_scene_scan, _ = registered(prior, identified, sides, config, frame, held(frame))
+            placed = registered(prior, identified, sides, config, frame)
+    if len(rows := standing_in_place(known, new, found, placed[1], frame, rooms, config)):
+        some = dataclasses.replace(identified, found=tuple(found[n] for n in rows))
+        placed = in_rows(placed, rows, registered(prior, some, sides, config, frame, stands=True))
+    result, T_scene_scan, _ = placed
     return [
         observation(
             result,
@@ -136,20 +141,31 @@ def relocalize(
     ], frame
 
 
-def still_held(
+def standing_in_place(
     old: Sequence[ObservedObject],
     new: Sequence[ObservedObject],
     found: Sequence[Found],
+    T_scene_scan: Float[np.ndarray, "p 4 4"],
+    frame: Frame,
     rooms: Rooms,
     config: SceneConfig,
-    frame: Frame,
-) -> Bool[np.ndarray, " p"]:
-    """Of the pairs found, which are `standing`, where registration asks whether things moved at all."""
+) -> Int[np.ndarray, " q"]:
+    """Which of the pairs found are `standing`, though registration moved them in their place.
+
+    `T_scene_scan`: poses of instances by registration.
+    """
     method = config.registration
     if not isinstance(method, SurfaceRegistration) or not method.try_stayed:
-        return np.zeros(len(found), bool)
+        return np.zeros(0, int)
     known, shown = ([o.points for o in side] for side in (old, new))
-    return standing(known, shown, [(f.object, f.instance) for f in found], frame, rooms)
+    rows = [
+        n
+        for n, f in enumerate(found)
+        if not np.allclose(T_scene_scan[n], frame.T_scene_scan, atol=SAME)
+        and not apart(known[f.object], apply_pose(frame.T_scene_scan, shown[f.instance]))
+    ]
+    pairs = [(found[n].object, found[n].instance) for n in rows]
+    return np.array(rows, int)[standing(known, shown, pairs, frame, rooms)]
 
 
 def registered(
@@ -158,29 +174,39 @@ def registered(
     sides: Callable[[tuple[Found, ...]], Sides],
     config: SceneConfig,
     frame: Frame,
-    held: Bool[np.ndarray, " q"],
-) -> tuple[Registration, Float[np.ndarray, "p 4 4"], Float[np.ndarray, "p 4 4"]]:
+    *,
+    stands: bool = False,
+) -> Registered:
     """All that was found registered, `frame` being the scan's; and the poses of instances in the scene's frame.
 
     Last the same poses aligned, where "it did not move" was taken as it is: else each would only confirm the frame.
     In batches of as many pairs as `config.memory_mb` holds. `sides`: objects and instances, some with what sensors saw
-    of them. `held`: of each whether it is `standing`.
+    of them. `stands`: whether all are `standing`.
     """
-    found, parts = identified.found, list[tuple[Registration, np.ndarray, np.ndarray]]()
+    found, parts = identified.found, list[Registered]()
     at_once = min(PAIRS_AT_ONCE, max(1, config.memory_mb // PAIR_MB))
     for start in range(0, len(found), at_once):
         some = found[start : start + at_once]
         pairs = pairs_found(identified, *sides(some), some)
         if frame is not identified.frame:
             pairs = with_frame(pairs, frame.T_scene_scan)
-        if held[start : start + at_once].any():
-            rows = np.zeros(len(pairs), bool)
-            rows[: len(some)] = held[start : start + at_once]
-            pairs = dataclasses.replace(pairs, standing=rows)
+        if stands:
+            pairs = dataclasses.replace(pairs, standing=np.ones(len(pairs), bool))
         result = jax.device_get(register(prior, pairs, config.registration, config.motion))
         T, aligned = result.T_target_source, result.aligned
         parts.append((result, pairs.to_world(T), pairs.to_world(T if aligned is None else aligned)))
     return parts[0] if len(parts) == 1 else jax.tree.map(lambda *x: np.concatenate(x), *parts)
+
+
+def in_rows(placed: Registered, rows: Int[np.ndarray, " q"], others: Registered) -> Registered:
+    """What is registered, with other results in some rows."""
+
+    def put(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        x = np.array(x)
+        x[rows] = y[: len(rows)]
+        return x
+
+    return jax.tree.map(put, placed, others)
 
 
 def with_views(

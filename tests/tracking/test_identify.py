@@ -53,7 +53,7 @@ def test_what_is_left_over_is_one_object_a_little_below_even_odds(monkeypatch):
     assert pairs(found) == [(0, 1), (1, 0)]
     assert set(found.gone) == {2} and set(found.new) == {2}
     low, high = sorted(f.score for f in found.found)
-    assert low < 0.7 < 0.9 < high  # the probability says how doubtful it is
+    assert low < 0.7 < 0.85 < high  # the probability says how doubtful it is
 
 
 def test_the_best_assignment_of_what_is_left_over_is_taken(monkeypatch):
