@@ -83,6 +83,7 @@ UNASKED = Calibration(intercept=3.7, likeness=5.8, apart_less=-6.3, apart_more=-
 # Of log odds beyond an even chance, what remains in those that a match is told with:
 # docs/developing/notebook/told_probabilities.md.
 REMAINS = 0.5
+FAR_M = 3.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -90,10 +91,11 @@ class Told:
     """How sure what an assignment took is told to be. It is likelier right than others of the same log odds."""
 
     taken: float  # log odds of a pair that is one object or is not with an even chance
-    mended: float  # and where it rests on masks that were divided, or that are missing
+    mended: float  # and where it rests on masks that were divided, or that are missing,
+    a_meter: float = 0.0  # and for every meter that it moved, up to `FAR_M`
 
 
-TOLD_UPRIGHT, TOLD_FREE = Told(taken=2.9, mended=-2.9), Told(taken=1.9, mended=-0.6)
+TOLD_UPRIGHT, TOLD_FREE = Told(taken=2.9, mended=-2.9), Told(taken=4.0, mended=-1.3, a_meter=-0.85)
 # Log odds that what one scan alone seems to have is not in the other, and what a share of further such things takes.
 ALONE, ALONE_LESS = 1.7, 6.2
 FEW_THINGS = 8  # as rooms have: of fewer, one more is no larger share
@@ -122,11 +124,15 @@ def probability(
 
 
 def told_probability(
-    odds: Float[np.ndarray, "*pairs"], search: SurfaceSearch, motion: MotionModel
+    odds: Float[np.ndarray, "*pairs"],
+    moved_m: Float[np.ndarray, "*pairs"],
+    search: SurfaceSearch,
+    motion: MotionModel,
 ) -> Float[np.ndarray, "*pairs"]:
     """Of pairs that an assignment took to be one object, by their log odds as `calibrated` has them."""
     told = TOLD_UPRIGHT if motion == "upright" else TOLD_FREE
-    return expit(told.taken + REMAINS * (odds - even_odds(search, motion)))
+    far = told.a_meter * np.minimum(moved_m, FAR_M)
+    return expit(told.taken + far + REMAINS * (odds - even_odds(search, motion)))
 
 
 def mended_probability(told: float, motion: MotionModel) -> float:

@@ -10,7 +10,7 @@ from collections.abc import Set
 
 import jax
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
 
 from more2_jax.config import EvidenceMatcher, MotionModel
@@ -46,9 +46,7 @@ def motion_odds(
     aligned: AlignedPairs, T_scene_scan: Pose, matcher: EvidenceMatcher, motion: MotionModel
 ) -> Float[np.ndarray, " p"]:
     """Log odds of how every pair moved, if it is one object, the scan lying at `T_scene_scan`: few things go far."""
-    k, i = aligned.rows.T
-    old, new = centers(aligned, T_scene_scan)
-    moved_m = np.minimum(np.linalg.norm(old[k] - new[i], axis=-1), FARTHEST_M)
+    moved_m = np.minimum(distances_m(aligned, T_scene_scan, aligned.rows), FARTHEST_M)
     a_meter = matcher.motion_weight * (1.0 if motion == "upright" else FREE_SHARE)
     return matcher.stayed_weight * stayed(aligned, T_scene_scan) - a_meter * moved_m
 
@@ -103,6 +101,14 @@ def share_on(cloud: Points, other: Points) -> float:
 def share_near(cloud: Points, other: Points, near_m: float = IN_PLACE_M) -> float:
     """Share of a cloud with a point of the other one so near."""
     return float(np.isfinite(KDTree(other).query(cloud, distance_upper_bound=near_m)[0]).mean())
+
+
+def distances_m(
+    aligned: AlignedPairs, T_scene_scan: Pose, pairs: Int[np.ndarray, "p 2"]
+) -> Float[np.ndarray, " p"]:
+    """Between the mean points of the objects and instances of pairs, in the scene's frame."""
+    old, new = centers(aligned, T_scene_scan)
+    return np.linalg.norm(old[pairs[:, 0]] - new[pairs[:, 1]], axis=-1)
 
 
 def centers(aligned: AlignedPairs, T_scene_scan: Pose) -> tuple[Points, Points]:

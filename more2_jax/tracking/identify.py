@@ -13,7 +13,7 @@ from more2_jax.matching.assignment import Chosen, LogOdds, assign, interchangeab
 from more2_jax.matching.calibration import alone_probability, even_odds, probability, told_probability
 from more2_jax.matching.candidates import AlignedPairs, odds_of
 from more2_jax.matching.code_assignment import match_instances
-from more2_jax.matching.places import IN_PLACE, in_place, motion_odds
+from more2_jax.matching.places import IN_PLACE, distances_m, in_place, motion_odds
 from more2_jax.network.embedding_batch import stack
 from more2_jax.network.prior import Prior
 from more2_jax.tracking.objects import SCENE_FRAME
@@ -164,7 +164,9 @@ def as_told(odds: LogOdds, pairs: Chosen, known: Identified, config: SceneConfig
     copies = interchangeable(odds, pairs)
     how = config.matching.search, config.motion
     gone, fresh = unmatched(odds, probability(odds.value, *how), pairs)
-    told = told_probability(odds.value[odds.rows_of(pairs)], *how)
+    assert known.aligned is not None
+    moved_m = distances_m(known.aligned, known.frame.T_scene_scan, pairs)
+    told = told_probability(odds.value[odds.rows_of(pairs)], moved_m, *how)
     found = tuple(
         Found(object=int(k), instance=int(i), score=float(p), interchangeable=c)
         for (k, i), p, c in zip(pairs, told, copies, strict=True)
