@@ -37,7 +37,7 @@ FIGURES = {
     "F1": ("added and removed, F1", ""),
     "told as changed without a mask": ("told as changed without a mask", ""),
     "told whether it moved": ("told whether it moved", "strict"),
-    **{f.name: (f.name, "") for f in CHANCES},
+    **{f.name.replace(",", ""): (f.name, "") for f in CHANCES},
     "t-mAP": ("t-mAP", ""),
     "t-AP50": ("t-AP50", ""),
     "median RE": ("MedRE of true pairs", "strict"),
