@@ -228,7 +228,8 @@ def with_poses_refined(
     for start in range(0, len(chosen), CLOSED_AT_ONCE):
         some = chosen[start : start + CLOSED_AT_ONCE]
         several = list(accumulated_objects(objects, some, scans))
-        refined = with_refined(objects, some, refine_object_poses(prior, several, config))
+        refined = refine_object_poses(prior, several, config)
+        refined = with_refined(objects, some, refined)
         objects = [o if set_in_motion(o, r, config) else r for o, r in zip(objects, refined, strict=True)]
         give_back(len(objects))
     return objects

@@ -121,24 +121,15 @@ def relocalize(
         frame = settled(views.objects, old, found, placed[2], placed[0], frame, new, config)
         if not np.array_equal(frame.T_scene_scan, identified.frame.T_scene_scan):
             placed = registered(prior, identified, sides, config, frame)
-    if len(rows := standing_in_place(known, new, found, placed[1], frame, rooms, config)):
-        some = dataclasses.replace(identified, found=tuple(found[n] for n in rows))
-        placed = in_rows(placed, rows, registered(prior, some, sides, config, frame, stands=True))
-    result, T_scene_scan, _ = placed
-    return [
-        observation(
-            result,
-            n,
-            old[f.object][1] @ T_scene_scan[n],
-            f,
-            scan,
-            views.instances[f.instance].id,
-            frame,
-            shows_again(known[f.object], new[f.instance], T_scene_scan[n]),
-            config,
-        )
-        for n, f in enumerate(found)
-    ], frame
+    rows = standing_in_place(known, new, found, placed[1], frame, rooms, config)
+    result, T_scene_scan, _ = held_in_rows(prior, identified, sides, config, frame, placed, rows)
+
+    def seen(n: int, f: Found) -> Observation:
+        T, instance = T_scene_scan[n], views.instances[f.instance].id
+        again = shows_again(known[f.object], new[f.instance], T)
+        return observation(result, n, old[f.object][1] @ T, f, scan, instance, frame, again, config)
+
+    return [seen(n, f) for n, f in enumerate(found)], frame
 
 
 def standing_in_place(
@@ -198,8 +189,20 @@ def registered(
     return parts[0] if len(parts) == 1 else jax.tree.map(lambda *x: np.concatenate(x), *parts)
 
 
-def in_rows(placed: Registered, rows: Int[np.ndarray, " q"], others: Registered) -> Registered:
-    """What is registered, with other results in some rows."""
+def held_in_rows(
+    prior: Prior,
+    identified: Identified,
+    sides: Callable[[tuple[Found, ...]], Sides],
+    config: SceneConfig,
+    frame: Frame,
+    placed: Registered,
+    rows: Int[np.ndarray, " q"],
+) -> Registered:
+    """What is registered, the pairs in some rows once more as what is `standing`."""
+    if not len(rows):
+        return placed
+    some = dataclasses.replace(identified, found=tuple(identified.found[n] for n in rows))
+    others = registered(prior, some, sides, config, frame, stands=True)
 
     def put(x: np.ndarray, y: np.ndarray) -> np.ndarray:
         x = np.array(x)
