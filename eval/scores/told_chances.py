@@ -23,7 +23,7 @@ MATCHES, CHANGES, MOTIONS = (
     for kind in KINDS
 )
 SHARE = Figure(name="", key="", statistic="mean", unit="%", scale=100)
-# What is told of matches and changes, and how it is: means, and how far apart they are by what is told.
+# Of each kind: what is told and what is so, in the mean, and how far apart they are by what is told.
 FIGURES = [
     figure
     for error in (MATCHES, CHANGES, MOTIONS)

@@ -37,7 +37,7 @@ class Track:
     matched: dict[int, float] = field(default_factory=dict)
     # that of this scan and the one before, one alone has it,
     alone: dict[int, float] = field(default_factory=dict)
-    # that it moved, or stayed, as `moved` has it.
+    # and that it moved, or stayed, as `moved` has it.
     motion: dict[int, float] = field(default_factory=dict)
 
 

@@ -15,6 +15,7 @@ from scipy.spatial import KDTree
 
 from more2_jax.geometry.near_points import NearPoints
 from more2_jax.geometry.poses import Points
+from more2_jax.geometry.room_alignment import THREADS
 
 # Chosen on rooms of regime `real`, docs/developing/notebook/mask_repair.md.
 AROUND_M = 0.75  # of the cloud: what is looked at
@@ -30,7 +31,6 @@ CONTINUES_M = 0.25  # so near the background's own points a plane goes on
 NEIGHBORS = 12  # of a point, itself among them: its normal
 TRIES, PLANES = 150, 8  # planes tried, at even steps; those found in turn, whether they bound the room or not
 BOX_SLACK = 1.001  # times a reach: a box that rounding takes nothing from
-THREADS = 4  # of a search in a tree: few, as scenes may be worked on side by side
 JUDGES = 1500  # points at even steps that choose among the planes tried
 
 

@@ -53,8 +53,8 @@ STAYED_RATIO, STAYED_OFFSET = 1.1, 0.01
 # A center that is shifted by less, a share of the radius, has not moved; a turn by less may be an error; what a turn in
 # place must fit better than no motion.
 IN_PLACE, NOT_TURNED_DEG, TURNED_RATIO, TURNED_OFFSET = 0.25, 15.0, 1.2, 0.01
-# Distance from which points of what still stands are apart, whatever its size, and how much farther apart they may be
-# as it stands than in another pose (docs/developing/notebook/still_standing.md).
+# Of what both scans show where it stood: the truncation of distances, whatever its size, and how many times those of
+# another pose its distances may be (docs/developing/notebook/still_standing.md).
 STANDING_M, STANDING_RATIO = 0.03, 1.3
 FINE = 0.25  # share of the truncation: the nearer one by which refined poses are told apart
 TURNED_DEG = 15.0  # competing poses differ by more

@@ -124,8 +124,6 @@ def moved_probability(o: SceneObject, before: Observation, after: Observation, c
     Measured motions are taken as normal about the true ones. Without an error (`paper`), 0 or 1. In a scan of unknown
     frame, no more than likely.
     """
-    if before.frame.unknown or after.frame.unknown:
-        return IN_DOUBT
     distance, angle_deg = motion_between(o, before, after)
     found = []
     for motion, limit, own in (
@@ -138,4 +136,5 @@ def moved_probability(o: SceneObject, before: Observation, after: Observation, c
         )
         limit = max(limit, SURE * error)
         found.append(float(ndtr((motion - limit) / error)) if error > 0 else float(motion > limit))
-    return max(found)
+    known = not (before.frame.unknown or after.frame.unknown)
+    return max(found) if known else min(max(found), IN_DOUBT)

@@ -20,7 +20,7 @@ from more2_jax.tracking.looked_at import NEAR_M, shares_still_there, spacing_of
 from more2_jax.tracking.rooms import LEAST_BACKGROUND, Rooms
 from more2_jax.types import Frame
 
-# Chosen on rooms of regime `real` and `sparse`, and two real captures: docs/developing/notebook/still_standing.md.
+# Chosen on rooms of regime `real` and `sparse`, and real captures: docs/developing/notebook/still_standing.md.
 # Log odds that a pair loses for each of the two that still stands where the other scan has it: likely, and surely.
 STANDS, SURELY_STANDS = 3.5, 8.0
 # Shares of a cloud's points that then lie on the other scan: half may lie on what was put there since; what was turned
