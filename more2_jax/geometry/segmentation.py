@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Integer
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
+from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import connected_components, dijkstra
 from scipy.spatial import KDTree
 
 from more2_jax.geometry.voxels import voxel_means, voxel_normals
@@ -30,8 +31,10 @@ class SegmentationConfig:
     room_m: float = 1.8  # floor and ceiling, or two facing walls, are this far apart: a table top is neither
     link_m: float = 0.06  # voxels this near touch where points are dense
     dense_points: float = 3.0  # a voxel, on average among neighbors
-    link_spacing: float = 2.0  # where points are sparse: times the distance of the last core neighbor
+    link_spacing: float = 1.0  # where points are sparse: times the distance of the last core neighbor
     largest_link_m: float = 0.2
+    beside_m: float = 0.12  # what lies this close to a floor or wall joins no two parts,
+    beside_reach_m: float = 0.2  # and belongs to a part that it touches along this way
     core_neighbors: int = 9  # fewer within reach: a voxel joins no two parts
     join_area_m2: float = 0.1  # a smaller cluster is a piece of a neighbor
     join_m: float = 0.15  # if one is this near
@@ -85,7 +88,8 @@ def segment_geometric(points: Float[np.ndarray, "n 3"], config: SegmentationConf
     normals = voxel_normals(voxels, config.normal_neighbors)
     planes, structure = boundary_planes(voxels, normals, config)
     cluster = np.full(len(voxels), -1)
-    cluster[~structure] = density_clusters(voxels[~structure], np.bincount(voxel_of)[~structure], config)
+    counts = np.bincount(voxel_of)
+    cluster[~structure] = clusters_off_planes(voxels[~structure], counts[~structure], planes, config)
     cluster = without_flat(voxels, small_joined(voxels, cluster, config), planes, config)
     instance, skipped = numbered(voxels, cluster, voxel_of, config)
     return Segmentation(instance=instance, planes=planes, skipped=skipped)
@@ -194,33 +198,74 @@ def _words(plane: Plane) -> str:
 # --- clusters -----------------------------------------------------------------------------------------------
 
 
-def density_clusters(
-    voxels: Float[np.ndarray, "v 3"], counts: Integer[np.ndarray, "v"], config: SegmentationConfig
+def clusters_off_planes(
+    voxels: Float[np.ndarray, "v 3"],
+    counts: Integer[np.ndarray, "v"],
+    planes: Sequence[Plane],
+    config: SegmentationConfig,
 ) -> Integer[np.ndarray, "v"]:
-    """DBSCAN whose radius follows the spacing of the points (`counts` a voxel); -1 for noise."""
+    """Clusters of what touches (`counts` of points a voxel), -1 for noise; what lies beside a wall joins no two.
+
+    Strips of walls and floors that are left over touch all that stands along them. What lies beside the planes that
+    are structure belongs to the part that it touches on a short way; the rest of it is clustered by itself.
+    """
     cluster = np.full(len(voxels), -1)
-    k = min(config.normal_neighbors, len(voxels) - 1)
-    if k < config.core_neighbors:
+    if len(voxels) <= config.core_neighbors:
         return cluster
+    near_m, core = touching(voxels, counts, config)
+    beside = np.zeros(len(voxels), bool)
+    for plane in (p for p in planes if p.structure):
+        beside |= np.abs(voxels @ plane.normal - plane.offset_m) < config.beside_m
+    _connect(cluster, near_m, core & ~beside)
+    if (cluster >= 0).any() and beside.any():
+        off = np.flatnonzero(cluster >= 0)
+        limit = {"limit": config.beside_reach_m, "min_only": True, "return_predecessors": True}
+        way_m, _, begun = dijkstra(near_m, directed=False, indices=off, **limit)
+        reached = core & beside & np.isfinite(way_m)
+        cluster[reached] = cluster[begun[reached]]
+    _connect(cluster, near_m, core & (cluster < 0))
+    return _with_rim(voxels, cluster, core, config)
+
+
+def touching(
+    voxels: Float[np.ndarray, "v 3"], counts: Integer[np.ndarray, "v"], config: SegmentationConfig
+) -> tuple[csr_matrix, Bool[np.ndarray, "v"]]:
+    """How far voxels lie that touch, and which have neighbors enough (DBSCAN's core).
+
+    The radius follows the spacing of the points: a scan has few of them far from its camera.
+    """
+    k = min(config.normal_neighbors, len(voxels) - 1)
     distance, near = (np.asarray(found)[:, 1:] for found in KDTree(voxels).query(voxels, k=k + 1))
     last = distance[:, config.core_neighbors - 1]
     dense = counts[near[:, : config.core_neighbors]].mean(axis=1) >= config.dense_points
     sparse_reach = np.clip(config.link_spacing * last, config.link_m, config.largest_link_m)
     reach = np.where(dense, config.link_m, sparse_reach)
     core = last <= reach
-    if not core.any():
-        return cluster
     # The lesser reach of two decides: stray points between two objects reach far, the objects do not.
     linked = (distance <= np.minimum(reach[:, None], reach[near])) & core[near] & core[:, None]
     a, slot = np.nonzero(linked)
-    graph = coo_matrix((np.ones(len(a), bool), (a, near[a, slot])), shape=(len(voxels), len(voxels)))
-    cluster[core] = connected_components(graph, directed=False)[1][core]
-    rest = np.flatnonzero(~core)
-    gap, nearest = map(
-        np.asarray, KDTree(voxels[core]).query(voxels[rest], distance_upper_bound=config.link_m)
-    )
-    reached = np.isfinite(gap)
-    cluster[rest[reached]] = cluster[core][nearest[reached]]
+    return csr_matrix((distance[a, slot], (a, near[a, slot])), shape=(len(voxels), len(voxels))), core
+
+
+def _connect(cluster: Integer[np.ndarray, "v"], near_m: csr_matrix, rows: Bool[np.ndarray, "v"]) -> None:
+    """Gives those rows that hang together new clusters."""
+    own = connected_components(near_m[rows][:, rows], directed=False)[1]
+    cluster[rows] = own + cluster.max(initial=-1) + 1
+
+
+def _with_rim(
+    voxels: Float[np.ndarray, "v 3"],
+    cluster: Integer[np.ndarray, "v"],
+    core: Bool[np.ndarray, "v"],
+    config: SegmentationConfig,
+) -> Integer[np.ndarray, "v"]:
+    """Voxels that are no core, too, each in the cluster that it lies at."""
+    rest, cluster = np.flatnonzero(~core), cluster.copy()
+    if len(rest) and core.any():
+        tree = KDTree(voxels[core])
+        gap, nearest = map(np.asarray, tree.query(voxels[rest], distance_upper_bound=config.link_m))
+        reached = np.isfinite(gap)
+        cluster[rest[reached]] = cluster[core][nearest[reached]]
     return cluster
 
 

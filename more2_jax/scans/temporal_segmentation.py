@@ -28,7 +28,7 @@ from more2_jax.geometry.segmentation import (
     Segmentation,
     SegmentationConfig,
     boundary_planes,
-    density_clusters,
+    clusters_off_planes,
     numbered,
     small_joined,
     without_flat,
@@ -164,7 +164,7 @@ def _instances(
     moved[free] = moved_voxels(points[free], surface.normals[free], state[free], config)
     cluster = np.full(len(points), -1)
     for part in (moved & ~structure, ~moved & ~structure):
-        own = density_clusters(points[part], surface.counts[part], clusters)
+        own = clusters_off_planes(points[part], surface.counts[part], planes, clusters)
         cluster[part] = np.where(own < 0, -1, own + cluster.max() + 1)
     cluster = small_joined(points, cluster, clusters)
     # What lies flat on a wall and was gone before is a thing, not a bend of the wall.
