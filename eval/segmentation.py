@@ -22,7 +22,8 @@ from eval.harness.results import write_rows
 from eval.harness.tables import on_screen
 from eval.scores.figures import Figure, Record, rows_of
 from eval.scores.segment_scores import SEGMENT_FIGURES, overlaps, segment_records
-from more2_jax.geometry.segmentation import SegmentationConfig, segment_geometric
+from more2_jax.geometry.segmentation import segment_geometric
+from more2_jax.geometry.segmentation_config import SegmentationConfig
 from more2_jax.scans.files.json_file import read_json
 from more2_jax.scans.files.npz import read_arrays
 from more2_jax.scans.labeled_cloud import ReadOptions

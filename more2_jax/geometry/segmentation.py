@@ -3,57 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Integer
-from scipy.sparse import csr_matrix
-from scipy.sparse.csgraph import connected_components, dijkstra
 from scipy.spatial import KDTree
 
+from more2_jax.geometry.boundary_planes import Plane, boundary_planes, extent, floor_of, words
+from more2_jax.geometry.segmentation_config import SegmentationConfig
+from more2_jax.geometry.things_on_tops import above_floor, stands_within, things_on_tops
+from more2_jax.geometry.touching_clusters import clusters_off_planes, touching
 from more2_jax.geometry.voxels import voxel_means, voxel_normals
 from more2_jax.types import Skipped
-
-
-@dataclass(frozen=True)
-class SegmentationConfig:
-    """Settings of `segment_geometric`; lengths in meters."""
-
-    voxel_m: float = 0.03
-    normal_neighbors: int = 20
-    plane_distance_m: float = 0.05  # a voxel this near belongs to the plane
-    plane_angle_deg: float = 30.0  # and if its normal turns less than this from the plane's
-    plane_tries: int = 400
-    planes: int = 12  # looked at, whether removed or not
-    structure_area_m2: float = 0.6  # smaller planes are parts of objects
-    behind_share: float = 0.04  # of the scene may lie beyond a floor or wall
-    structure_share: float = 0.35  # of the scene's extent that a floor or wall spans at least
-    room_m: float = 1.8  # floor and ceiling, or two facing walls, are this far apart: a table top is neither
-    link_m: float = 0.06  # voxels this near touch where points are dense
-    dense_points: float = 3.0  # a voxel, on average among neighbors
-    link_spacing: float = 1.0  # where points are sparse: times the distance of the last core neighbor
-    largest_link_m: float = 0.2
-    beside_m: float = 0.12  # what lies this close to a floor or wall joins no two parts,
-    beside_reach_m: float = 0.2  # and belongs to a part that it touches along this way
-    core_neighbors: int = 9  # fewer within reach: a voxel joins no two parts
-    join_area_m2: float = 0.1  # a smaller cluster is a piece of a neighbor
-    join_m: float = 0.15  # if one is this near
-    flat_m: float = 0.15  # a cluster that lies this close to a floor or wall is a part of it
-    flat_share: float = 0.9  # with this share of its voxels
-    smallest_area_m2: float = 0.03  # of its voxels
-    smallest_extent_m: float = 0.2
-    seed: int = 0
-
-
-@dataclass(frozen=True, kw_only=True)
-class Plane:
-    """`normal · p = offset_m`; the normal points to where the scene lies."""
-
-    normal: Float[np.ndarray, "3"]
-    offset_m: float
-    area_m2: float  # of the voxels on it
-    behind: float  # share of the scene beyond it
-    structure: bool  # floor, wall or ceiling: removed
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,8 +27,8 @@ class Segmentation:
 
     def sentences(self) -> tuple[str, ...]:
         """What was removed and kept, in words."""
-        removed = [_words(p) for p in self.planes if p.structure]
-        kept = [_words(p) for p in self.planes if not p.structure]
+        removed = [words(p) for p in self.planes if p.structure]
+        kept = [words(p) for p in self.planes if not p.structure]
         said = [f"removed as floor or wall: {'; '.join(removed) or 'no plane'}"]
         if kept:
             said.append(f"large planes kept as parts of objects: {'; '.join(kept)}")
@@ -87,194 +48,40 @@ def segment_geometric(points: Float[np.ndarray, "n 3"], config: SegmentationConf
     voxels, voxel_of = voxel_means(points, config.voxel_m)
     normals = voxel_normals(voxels, config.normal_neighbors)
     planes, structure = boundary_planes(voxels, normals, config)
-    cluster = np.full(len(voxels), -1)
-    counts = np.bincount(voxel_of)
-    cluster[~structure] = clusters_off_planes(voxels[~structure], counts[~structure], planes, config)
-    cluster = without_flat(voxels, small_joined(voxels, cluster, config), planes, config)
+    cluster, apart = np.full(len(voxels), -1), np.zeros(len(voxels), bool)
+    free, counts = ~structure, np.bincount(voxel_of)
+    cluster[free], apart[free] = clustered(voxels[free], normals[free], counts[free], planes, config)
+    cluster = without_flat(voxels, small_joined(voxels, cluster, apart, config), planes, config)
     instance, skipped = numbered(voxels, cluster, voxel_of, config)
     return Segmentation(instance=instance, planes=planes, skipped=skipped)
 
 
-def _extent(points: Float[np.ndarray, "n 3"]) -> float:
-    """Length along the direction of greatest spread, in any frame the same."""
-    if not len(points):
-        return 0.0
-    centered = points - points.mean(axis=0)
-    return float(np.ptp(centered @ np.linalg.eigh(centered.T @ centered)[1][:, -1]))
-
-
-# --- planes -------------------------------------------------------------------------------------------------
-
-
-def boundary_planes(
-    voxels: Float[np.ndarray, "v 3"], normals: Float[np.ndarray, "v 3"], config: SegmentationConfig
-) -> tuple[tuple[Plane, ...], Bool[np.ndarray, "v"]]:
-    """The largest planes one after the other, and the voxels on or beyond those that are structure."""
-    rng = np.random.default_rng(config.seed)
-    free = np.ones(len(voxels), bool)  # not yet on any plane
-    structure = np.zeros(len(voxels), bool)
-    planes: list[Plane] = []
-    scene_m = _extent(voxels)
-    for _ in range(config.planes):
-        if (found := _largest_plane(voxels, normals, free, config, rng)) is None:
-            break
-        normal, offset = found
-        on = _on_plane(voxels, normals, normal, offset, config)
-        area = float((on & free).sum()) * config.voxel_m**2
-        if area < config.structure_area_m2:
-            break
-        height = voxels @ normal - offset
-        sides = np.array(
-            [(height < -config.plane_distance_m).mean(), (height > config.plane_distance_m).mean()]
-        )
-        sign = -1.0 if sides[0] > sides[1] else 1.0
-        plane = Plane(
-            normal=sign * normal,
-            offset_m=sign * offset,
-            area_m2=area,
-            behind=float(sides.min()),
-            structure=False,
-        )
-        wide = _extent(voxels[on]) >= config.structure_share * scene_m
-        if wide and plane.behind <= config.behind_share and not _before_another(plane, planes, config):
-            plane = replace(plane, structure=True)
-            structure |= on | (sign * height < -config.plane_distance_m)
-        free &= ~on
-        planes.append(plane)
-    return tuple(planes), structure
-
-
-def _before_another(plane: Plane, planes: list[Plane], config: SegmentationConfig) -> bool:
-    """Whether it faces a floor or wall from nearer than a room is wide: a table top, a cabinet's door."""
-    return any(
-        p.structure
-        and p.normal @ plane.normal < -np.cos(np.deg2rad(config.plane_angle_deg))
-        and -plane.offset_m - p.offset_m < config.room_m
-        for p in planes
-    )
-
-
-def _largest_plane(
+def clustered(
     voxels: Float[np.ndarray, "v 3"],
     normals: Float[np.ndarray, "v 3"],
-    free: Bool[np.ndarray, "v"],
-    config: SegmentationConfig,
-    rng: np.random.Generator,
-) -> tuple[Float[np.ndarray, "3"], float] | None:
-    """RANSAC with one voxel and its normal a try; the best is fitted again to the voxels on it."""
-    rows = np.flatnonzero(free)
-    if len(rows) * config.voxel_m**2 < config.structure_area_m2:
-        return None
-    tries = rng.choice(rows, config.plane_tries)
-    judges = rng.choice(rows, min(len(rows), 6000), replace=False)
-    tried = normals[tries]
-    offsets = np.einsum("ti,ti->t", voxels[tries], tried)
-    near = np.abs(voxels[judges] @ tried.T - offsets) < config.plane_distance_m
-    along = np.abs(normals[judges] @ tried.T) > np.cos(np.deg2rad(config.plane_angle_deg))
-    best = int((near & along).sum(axis=0).argmax())
-    normal, offset = tried[best], float(offsets[best])
-    for _ in range(3):
-        on = voxels[_on_plane(voxels, normals, normal, offset, config) & free]
-        if len(on) < 3:
-            return None
-        center = on.mean(axis=0)
-        normal = np.linalg.eigh((on - center).T @ (on - center))[1][:, 0]
-        offset = float(center @ normal)
-    return normal, offset
-
-
-def _on_plane(
-    voxels: np.ndarray, normals: np.ndarray, normal: np.ndarray, offset: float, config: SegmentationConfig
-) -> Bool[np.ndarray, "v"]:
-    near = np.abs(voxels @ normal - offset) < config.plane_distance_m
-    return near & (np.abs(normals @ normal) > np.cos(np.deg2rad(config.plane_angle_deg)))
-
-
-def _words(plane: Plane) -> str:
-    normal = ", ".join(f"{c:.2f}" for c in plane.normal + 0.0)
-    return f"{plane.area_m2:.1f} m² facing ({normal}) with {100 * plane.behind:.1f} % of the scene behind"
-
-
-# --- clusters -----------------------------------------------------------------------------------------------
-
-
-def clusters_off_planes(
-    voxels: Float[np.ndarray, "v 3"],
     counts: Integer[np.ndarray, "v"],
     planes: Sequence[Plane],
     config: SegmentationConfig,
-) -> Integer[np.ndarray, "v"]:
-    """Clusters of what touches (`counts` of points a voxel), -1 for noise; what lies beside a wall joins no two.
-
-    Strips of walls and floors that are left over touch all that stands along them. What lies beside the planes that
-    are structure belongs to the part that it touches on a short way; the rest of it is clustered by itself.
-    """
-    cluster = np.full(len(voxels), -1)
+) -> tuple[Integer[np.ndarray, "v"], Bool[np.ndarray, "v"]]:
+    """Clusters of what touches, from 0, -1 for noise; and what stands on the top of another, each a cluster."""
     if len(voxels) <= config.core_neighbors:
-        return cluster
+        return np.full(len(voxels), -1), np.zeros(len(voxels), bool)
     near_m, core = touching(voxels, counts, config)
-    beside = np.zeros(len(voxels), bool)
-    for plane in (p for p in planes if p.structure):
-        beside |= np.abs(voxels @ plane.normal - plane.offset_m) < config.beside_m
-    _connect(cluster, near_m, core & ~beside)
-    if (cluster >= 0).any() and beside.any():
-        off = np.flatnonzero(cluster >= 0)
-        limit = {"limit": config.beside_reach_m, "min_only": True, "return_predecessors": True}
-        way_m, _, begun = dijkstra(near_m, directed=False, indices=off, **limit)
-        reached = core & beside & np.isfinite(way_m)
-        cluster[reached] = cluster[begun[reached]]
-    _connect(cluster, near_m, core & (cluster < 0))
-    return _with_rim(voxels, cluster, core, config)
-
-
-def touching(
-    voxels: Float[np.ndarray, "v 3"], counts: Integer[np.ndarray, "v"], config: SegmentationConfig
-) -> tuple[csr_matrix, Bool[np.ndarray, "v"]]:
-    """How far voxels lie that touch, and which have neighbors enough (DBSCAN's core).
-
-    The radius follows the spacing of the points: a scan has few of them far from its camera.
-    """
-    k = min(config.normal_neighbors, len(voxels) - 1)
-    distance, near = (np.asarray(found)[:, 1:] for found in KDTree(voxels).query(voxels, k=k + 1))
-    last = distance[:, config.core_neighbors - 1]
-    dense = counts[near[:, : config.core_neighbors]].mean(axis=1) >= config.dense_points
-    sparse_reach = np.clip(config.link_spacing * last, config.link_m, config.largest_link_m)
-    reach = np.where(dense, config.link_m, sparse_reach)
-    core = last <= reach
-    # The lesser reach of two decides: stray points between two objects reach far, the objects do not.
-    linked = (distance <= np.minimum(reach[:, None], reach[near])) & core[near] & core[:, None]
-    a, slot = np.nonzero(linked)
-    return csr_matrix((distance[a, slot], (a, near[a, slot])), shape=(len(voxels), len(voxels))), core
-
-
-def _connect(cluster: Integer[np.ndarray, "v"], near_m: csr_matrix, rows: Bool[np.ndarray, "v"]) -> None:
-    """Gives those rows that hang together new clusters."""
-    own = connected_components(near_m[rows][:, rows], directed=False)[1]
-    cluster[rows] = own + cluster.max(initial=-1) + 1
-
-
-def _with_rim(
-    voxels: Float[np.ndarray, "v 3"],
-    cluster: Integer[np.ndarray, "v"],
-    core: Bool[np.ndarray, "v"],
-    config: SegmentationConfig,
-) -> Integer[np.ndarray, "v"]:
-    """Voxels that are no core, too, each in the cluster that it lies at."""
-    rest, cluster = np.flatnonzero(~core), cluster.copy()
-    if len(rest) and core.any():
-        tree = KDTree(voxels[core])
-        gap, nearest = map(np.asarray, tree.query(voxels[rest], distance_upper_bound=config.link_m))
-        reached = np.isfinite(gap)
-        cluster[rest[reached]] = cluster[core][nearest[reached]]
-    return cluster
+    cluster = clusters_off_planes(voxels, near_m, core, planes, config)
+    thing = things_on_tops(voxels, normals, cluster, near_m, planes, config)
+    apart = thing >= 0
+    return np.where(apart, thing + cluster.max(initial=-1) + 1, cluster), apart
 
 
 def small_joined(
-    voxels: Float[np.ndarray, "v 3"], cluster: Integer[np.ndarray, "v"], config: SegmentationConfig
+    voxels: Float[np.ndarray, "v 3"],
+    cluster: Integer[np.ndarray, "v"],
+    apart: Bool[np.ndarray, "v"],
+    config: SegmentationConfig,
 ) -> Integer[np.ndarray, "v"]:
-    """Pieces given to the nearest other cluster, the smallest first: a leg to its table."""
+    """Pieces given to the nearest other cluster, the smallest first: a leg to its table. None of what is `apart`."""
     cluster = cluster.copy()
-    ids, counts = np.unique(cluster[cluster >= 0], return_counts=True)
+    ids, counts = np.unique(cluster[(cluster >= 0) & ~apart], return_counts=True)
     small = counts * config.voxel_m**2 < config.join_area_m2
     for piece in ids[small][np.argsort(counts[small], kind="stable")]:
         rows, others = cluster == piece, (cluster >= 0) & (cluster != piece)
@@ -294,16 +101,35 @@ def without_flat(
     planes: tuple[Plane, ...],
     config: SegmentationConfig,
 ) -> Integer[np.ndarray, "v"]:
-    """Without patches of floors and walls: sensors warp a wall at the border of their view."""
-    cluster = cluster.copy()
-    for plane in planes:
-        if plane.structure:
-            clustered = cluster >= 0
-            total = np.bincount(cluster[clustered], minlength=1)
-            near = clustered & (np.abs(voxels @ plane.normal - plane.offset_m) < config.flat_m)
-            flat = np.bincount(cluster[near], minlength=len(total)) > config.flat_share * total
-            cluster[clustered & flat[cluster]] = -1
+    """Without patches of floors and walls: sensors warp a wall at the border of their view.
+
+    What rises from a floor that lies around it is a thing: a pillow.
+    """
+    cluster, floor = cluster.copy(), floor_of(planes)
+    for plane in (p for p in planes if p.structure):
+        of_one = cluster >= 0
+        total = np.bincount(cluster[of_one], minlength=1)
+        near = of_one & (np.abs(voxels @ plane.normal - plane.offset_m) < config.flat_m)
+        flat = np.bincount(cluster[near], minlength=len(total)) > config.flat_share * total
+        if plane is floor:
+            flat[[k for k in np.flatnonzero(flat) if _rises(voxels, cluster, int(k), plane, config)]] = False
+        cluster[of_one & flat[cluster]] = -1
     return cluster
+
+
+def _rises(
+    voxels: Float[np.ndarray, "v 3"],
+    cluster: Integer[np.ndarray, "v"],
+    k: int,
+    floor: Plane,
+    config: SegmentationConfig,
+) -> bool:
+    """Whether a cluster stands out from the floor around it."""
+    flat, height = above_floor(voxels, floor)
+    own = cluster == k
+    bare = flat[(cluster < 0) & (np.abs(height) < config.plane_distance_m)]
+    high = float(np.percentile(height[own], 95)) > config.lowest_m
+    return high and stands_within(flat[own], bare, config)
 
 
 def numbered(
@@ -327,4 +153,4 @@ def numbered(
 
 def _is_large(voxels: Float[np.ndarray, "v 3"], config: SegmentationConfig) -> bool:
     area = len(voxels) * config.voxel_m**2
-    return area >= config.smallest_area_m2 and _extent(voxels) >= config.smallest_extent_m
+    return area >= config.smallest_area_m2 and extent(voxels) >= config.smallest_extent_m

@@ -9,7 +9,8 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float, Integer
 
-from more2_jax.geometry.segmentation import SegmentationConfig, segment_geometric
+from more2_jax.geometry.segmentation import segment_geometric
+from more2_jax.geometry.segmentation_config import SegmentationConfig
 from more2_jax.geometry.up_axis import R_UP
 from more2_jax.scans.formats.registry import FORMATS, WITH_DEPTH_FRAMES
 from more2_jax.scans.labeled_cloud import CUT_WITHOUT, LabeledCloud, ReadOptions, one_line

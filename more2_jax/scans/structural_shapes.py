@@ -9,7 +9,8 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Bool, Float, Integer
 
-from more2_jax.geometry.segmentation import Plane, SegmentationConfig, boundary_planes
+from more2_jax.geometry.boundary_planes import Plane, boundary_planes
+from more2_jax.geometry.segmentation_config import SegmentationConfig
 from more2_jax.geometry.voxels import LARGEST_GRID, voxel_means, voxel_normals
 from more2_jax.types import Skipped
 

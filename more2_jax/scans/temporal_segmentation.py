@@ -16,6 +16,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 from scipy.spatial import KDTree
 
+from more2_jax.geometry.boundary_planes import boundary_planes
 from more2_jax.geometry.poses import Points, Pose
 from more2_jax.geometry.room_alignment import (
     RoomFit,
@@ -24,15 +25,8 @@ from more2_jax.geometry.room_alignment import (
     fit_from_any_yaw,
     room_shape,
 )
-from more2_jax.geometry.segmentation import (
-    Segmentation,
-    SegmentationConfig,
-    boundary_planes,
-    clusters_off_planes,
-    numbered,
-    small_joined,
-    without_flat,
-)
+from more2_jax.geometry.segmentation import Segmentation, clustered, numbered, small_joined, without_flat
+from more2_jax.geometry.segmentation_config import SegmentationConfig
 from more2_jax.scans.seen_empty import (
     EMPTIED,
     STAYED,
@@ -162,11 +156,13 @@ def _instances(
     free = np.flatnonzero(~structure)
     moved = np.zeros(len(points), bool)
     moved[free] = moved_voxels(points[free], surface.normals[free], state[free], config)
-    cluster = np.full(len(points), -1)
+    cluster, apart = np.full(len(points), -1), np.zeros(len(points), bool)
     for part in (moved & ~structure, ~moved & ~structure):
-        own = clusters_off_planes(points[part], surface.counts[part], planes, clusters)
+        own, apart[part] = clustered(
+            points[part], surface.normals[part], surface.counts[part], planes, clusters
+        )
         cluster[part] = np.where(own < 0, -1, own + cluster.max() + 1)
-    cluster = small_joined(points, cluster, clusters)
+    cluster = small_joined(points, cluster, apart, clusters)
     # What lies flat on a wall and was gone before is a thing, not a bend of the wall.
     thing = (cluster >= 0) & (_share(moved, cluster)[cluster] > MOST)
     cluster = np.where(thing, cluster, without_flat(points, cluster, planes, clusters))

@@ -17,7 +17,8 @@ from scipy.spatial import KDTree
 
 from more2_jax.geometry.near_points import rms_radius
 from more2_jax.geometry.poses import Points, apply_pose
-from more2_jax.geometry.segmentation import SegmentationConfig, segment_geometric
+from more2_jax.geometry.segmentation import segment_geometric
+from more2_jax.geometry.segmentation_config import SegmentationConfig
 from more2_jax.geometry.voxels import LARGEST_GRID
 from more2_jax.matching.candidates import portable
 from more2_jax.network.embedding_batch import embed

@@ -14,7 +14,8 @@ from scipy.spatial.transform import Rotation
 
 from more2_jax.cli.main import main
 from more2_jax.config import preset
-from more2_jax.geometry.segmentation import SegmentationConfig, segment_geometric
+from more2_jax.geometry.segmentation import segment_geometric
+from more2_jax.geometry.segmentation_config import SegmentationConfig
 from more2_jax.network.prior import init_prior, save_prior
 from more2_jax.scans.read_scan import read_scan
 from more2_jax.storage.scene_folder import load_scene, save_scene
@@ -94,6 +95,70 @@ def test_a_table_top_over_a_floor_stays():
     of_top = found.instance[(truth == 1) & (points[:, 2] > 0.69)]
     assert (of_top == 1).mean() > 0.95
     assert any(not p.structure for p in found.planes)
+
+
+def table(rng: np.random.Generator) -> np.ndarray:
+    """A top of 1 × 0.8 m, 0.7 m above the floor, on a column."""
+    return np.concatenate(
+        [
+            rectangle([1, 1, 0.68], [2, 1.8, 0.7], 12_000, rng),
+            rectangle([1.4, 1.3, 0], [1.6, 1.5, 0.68], 4000, rng),
+        ]
+    )
+
+
+def of_parts(found: np.ndarray, truth: np.ndarray) -> list[int]:
+    """The instance that most points of each part are in."""
+    return [int(np.bincount(found[truth == t]).argmax()) for t in range(1, truth.max() + 1)]
+
+
+@pytest.mark.parametrize("turn_deg", [0, 35])
+def test_what_stands_on_a_table_is_a_thing_of_its_own(turn_deg: float):
+    rng = np.random.default_rng(8)
+    points, truth = room(table(rng), box([1.6, 1.3, 0.86], 0.3, rng))
+    points = Rotation.from_euler("z", turn_deg, degrees=True).apply(points)
+    found = segment_geometric(points, CONFIG).instance
+    assert found.max() == 2
+    assert len(set(of_parts(found, truth))) == 2
+    assert agreement(found, truth) > 0.75
+
+
+def test_a_back_at_the_edge_of_a_seat_and_a_column_below_a_top_are_no_things():
+    rng = np.random.default_rng(9)
+    back = rectangle([1, 1, 0.7], [1.04, 1.8, 1.2], 8000, rng)
+    points, truth = room(table(rng), back)
+    found = segment_geometric(points, CONFIG).instance
+    assert found.max() == 1
+    assert (found[truth > 0] == 1).mean() > 0.98
+
+
+def test_without_a_floor_nothing_is_said_to_stand_on_another():
+    rng = np.random.default_rng(8)
+    points = np.concatenate([table(rng), box([1.6, 1.3, 0.86], 0.3, rng)])
+    assert segment_geometric(points, CONFIG).instance.max() == 1
+
+
+@pytest.mark.parametrize(("rises_m", "things"), [(0.13, 1), (0.06, 0)])
+def test_a_pillow_on_the_floor_is_a_thing_and_a_rug_is_not(rises_m: float, things: int):
+    rng = np.random.default_rng(10)
+    p = rectangle([1.2, 1.2, 0], [1.8, 1.7, 0], 8000, rng)
+    across = np.abs((p[:, :2] - [1.5, 1.45]) / [0.3, 0.25]).max(axis=1)
+    p[:, 2] = rises_m * np.minimum(4 * (1 - across), 1)
+    points, truth = room(p)
+    found = segment_geometric(points, CONFIG).instance
+    assert found.max() == things
+    assert not found[truth == 0].any() or things
+
+
+def test_what_is_left_of_a_wall_joins_no_two():
+    """Boxes along a wall, of which a strip lies 7 cm before the rest, as drift doubles it."""
+    rng = np.random.default_rng(11)
+    strip = rectangle([0.06, 0, 0.1], [0.08, 3, 0.7], 20_000, rng)
+    points, truth = room(box([0.42, 0.6, 0.36], 0.6, rng), box([0.42, 2.2, 0.36], 0.6, rng), strip)
+    found = segment_geometric(points, CONFIG).instance
+    first, second, _ = of_parts(found, truth)
+    assert first != second
+    assert agreement(found[truth < 3], truth[truth < 3]) > 0.75
 
 
 def test_a_wide_table_in_a_room_without_a_ceiling_is_no_ceiling():

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from more2_jax.geometry.segmentation import SegmentationConfig, segment_geometric
+from more2_jax.geometry.segmentation import segment_geometric
+from more2_jax.geometry.segmentation_config import SegmentationConfig
 from more2_jax.scans.seen_empty import EMPTIED, STAYED, UNKNOWN, UnlabeledScan
 from more2_jax.scans.temporal_segmentation import (
     ChangeConfig,
