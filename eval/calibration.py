@@ -20,10 +20,10 @@ from scipy.optimize import minimize
 from scipy.special import expit
 
 from eval.data.flyingshape import flyingshape
-from eval.data.masks import DAMAGES, with_masks
 from eval.data.truth import Benchmark, KnownScene
 from eval.harness.options import Masks
 from eval.harness.plots import draw_reliability
+from eval.harness.runs import masked
 from eval.scores.reliability import Bin, calibration_error, reliability
 from more2_jax.config import EvidenceMatcher, SceneConfig, preset
 from more2_jax.matching.assignment import NEVER, LogOdds, assign
@@ -116,7 +116,7 @@ def scenes_of(
         for name in track(benchmark.names[: scenes or None], description=folder.name):
             scene = benchmark.read(name).first_scans(visits)
             for m in masks:
-                yield f"{folder}/{name}", with_masks(scene, DAMAGES[m]) if m in DAMAGES else scene
+                yield f"{folder}/{name}", masked(scene, m)
 
 
 def asked(config: SceneConfig) -> dict[str, Calibration]:

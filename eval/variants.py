@@ -18,10 +18,10 @@ from rich.console import Console
 from rich.table import Table
 
 from eval.data.flyingshape import flyingshape
-from eval.data.masks import DAMAGES, with_masks
 from eval.data.truth import KnownScene
 from eval.end_to_end import living_scenes
 from eval.harness.options import Masks
+from eval.harness.runs import masked
 from eval.scores.figures import Record
 from eval.scores.mended_masks import with_mended_masks
 from eval.scores.tracks import changes_f1, score_tracks, tracks_of
@@ -69,7 +69,7 @@ def main(
     for folder in data:
         rooms = flyingshape(folder)
         known = [rooms.read(n).first_scans(visits) for n in rooms.names[: scenes or None]]
-        known = [with_masks(s, DAMAGES[masks]) if masks in DAMAGES else s for s in known]
+        known = [masked(s, masks) for s in known]
         robust = preset("robust", upright=rooms.upright)
         for variant in (*([""] if as_is else []), *set):
             row = row_of(known, weights, changed(robust, variant), rooms.right_deg)

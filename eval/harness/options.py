@@ -22,7 +22,7 @@ from more2_jax.config import (
 )
 
 Descending = DescentRegistration | FieldRegistration
-Masks = Literal["true", "merged", "split", "eroded", "wrong", "predicted"]
+Masks = Literal["true", "merged", "split", "eroded", "wrong", "predicted", "geometric", "changes"]
 OURS = "ours"  # methods whose names begin so
 SCENES_A_CHUNK = 4
 
@@ -51,7 +51,8 @@ class Options:
     visits: int = 0
     """How many scans of each scene, from the first; 0 for all."""
     masks: Masks = "true"
-    """true, damaged on purpose, or (3rscan) predicted: mask3d.labels.npz beside each scan."""
+    """true, damaged on purpose, or (3rscan) predicted: mask3d.labels.npz beside each scan; geometric and changes: none,
+    rooms of regime real are cut as --segment does."""
     upright: Literal["auto", "yes", "no", "found"] = "auto"
     """Whether the method is told that objects only turn about the vertical; auto: as the data were made; found (of
     whole scenes): it is told nothing, as `more2 run`, and peers as the data were made."""

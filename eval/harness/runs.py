@@ -25,6 +25,7 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
+from eval.data.cut_scans import CUTS, with_cuts
 from eval.data.flyingshape import digest
 from eval.data.masks import DAMAGES, with_masks
 from eval.data.truth import Benchmark, KnownScene
@@ -152,6 +153,8 @@ def read_chunk(run: Run, o: Options, names: Sequence[str]) -> list[KnownScene]:
 
 def masked(scene: KnownScene, masks: str) -> KnownScene:
     """The scene through the masks asked for."""
+    if masks in CUTS:
+        return with_cuts(scene, masks)
     return with_masks(scene, DAMAGES[masks]) if masks in DAMAGES else scene
 
 
