@@ -33,7 +33,8 @@ class SegmentationConfig:
     top_area_m2: float = 0.08  # of a level that something may stand on: a table top, the floor
     top_m: float = 0.03  # how far from its height its voxels lie
     foot_m: float = 0.1  # a thing stands by what of it lies this close above the level,
-    inside_share: float = 0.6  # which lies within the level's outline, all but the rest,
+    foot_share: float = 0.6  # whose outline has at most this share of the level's area,
+    inside_share: float = 0.6  # and lies within that, all but the rest,
     around_m: float = 0.15  # and has the level around it, this near,
     around: int = 5  # in so many of twelve directions
     lowest_m: float = 0.08  # what rises less above the floor is a part of it

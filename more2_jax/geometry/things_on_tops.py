@@ -114,13 +114,17 @@ def patch_at(level: Flat, foot: Flat, config: SegmentationConfig) -> Flat:
 
 
 def stands_within(foot: Flat, patch: Flat, config: SegmentationConfig) -> bool:
-    """Whether a foot lies within the outline of a level, and has the level around it in several directions."""
-    if len(foot) < 3 or len(patch) * config.voxel_m**2 < config.top_area_m2:
-        return False
+    """Whether a foot lies within the outline of a level, is smaller, and has it around in several directions.
+
+    Posts of a shelf stand within the outline of its lowest board, too, but all over it.
+    """
     try:
-        edges = ConvexHull(patch).equations
-    except QhullError:  # a line
+        outline, own = ConvexHull(patch), ConvexHull(foot)
+    except (QhullError, ValueError):  # too few, or on a line
         return False
+    if len(patch) * config.voxel_m**2 < config.top_area_m2 or own.volume > config.foot_share * outline.volume:
+        return False
+    edges = outline.equations
     inside = (foot @ edges[:, :2].T + edges[:, 2] <= -config.voxel_m).all(axis=1)
     if float(inside.mean()) < config.inside_share:
         return False

@@ -132,6 +132,18 @@ def test_a_back_at_the_edge_of_a_seat_and_a_column_below_a_top_are_no_things():
     assert (found[truth > 0] == 1).mean() > 0.98
 
 
+def test_arms_and_back_around_a_seat_are_no_thing():
+    rng = np.random.default_rng(12)
+    seat = rectangle([1, 1, 0.4], [2.2, 1.9, 0.42], 12_000, rng)
+    base = rectangle([1, 1, 0], [2.2, 1.02, 0.4], 6000, rng)
+    arms = [rectangle([x, 1.1, 0.4], [x + 0.05, 1.8, 0.65], 4000, rng) for x in (1.1, 2.05)]
+    back = rectangle([1.1, 1.75, 0.4], [2.1, 1.8, 0.8], 6000, rng)
+    points, truth = room(np.concatenate([seat, base, *arms, back]))
+    found = segment_geometric(points, CONFIG).instance
+    assert found.max() == 1
+    assert (found[truth == 1] == 1).mean() > 0.95
+
+
 def test_without_a_floor_nothing_is_said_to_stand_on_another():
     rng = np.random.default_rng(8)
     points = np.concatenate([table(rng), box([1.6, 1.3, 0.86], 0.3, rng)])
