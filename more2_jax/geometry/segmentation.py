@@ -103,17 +103,30 @@ def without_flat(
 ) -> Integer[np.ndarray, "v"]:
     """Without patches of floors and walls: sensors warp a wall at the border of their view.
 
-    What rises from a floor that lies around it is a thing: a pillow.
+    Nor strips along several of them, as drift leaves in corners. What rises from a floor that lies around it is a
+    thing: a pillow.
     """
-    cluster, floor = cluster.copy(), floor_of(planes)
-    for plane in (p for p in planes if p.structure):
-        of_one = cluster >= 0
-        total = np.bincount(cluster[of_one], minlength=1)
-        near = of_one & (np.abs(voxels @ plane.normal - plane.offset_m) < config.flat_m)
-        flat = np.bincount(cluster[near], minlength=len(total)) > config.flat_share * total
+    cluster, structure = cluster.copy(), [p for p in planes if p.structure]
+    count = cluster.max(initial=-1) + 1
+    total = np.bincount(cluster[cluster >= 0], minlength=count)
+    near = np.zeros((len(structure), len(voxels)), bool)
+    for of_plane, plane in zip(near, structure, strict=True):
+        of_plane[:] = np.abs(voxels @ plane.normal - plane.offset_m) < config.flat_m
+
+    def mostly(rows: Bool[np.ndarray, "v"]) -> Bool[np.ndarray, " k"]:
+        return np.bincount(cluster[rows & (cluster >= 0)], minlength=count) > config.flat_share * total
+
+    flat, floor = np.zeros(count, bool), floor_of(planes)
+    for of_plane, plane in zip(near, structure, strict=True):
+        of_one = mostly(of_plane)
         if plane is floor:
-            flat[[k for k in np.flatnonzero(flat) if _rises(voxels, cluster, int(k), plane, config)]] = False
-        cluster[of_one & flat[cluster]] = -1
+            of_one[[k for k in np.flatnonzero(of_one) if _rises(voxels, cluster, int(k), plane, config)]] = (
+                False
+            )
+        flat |= of_one
+    for k in np.flatnonzero(mostly(near.any(axis=0)) & ~flat):
+        flat[k] = extent(voxels[cluster == k]) > config.strip_m
+    cluster[np.append(flat, False)[cluster]] = -1  # the last is that of -1
     return cluster
 
 

@@ -30,6 +30,7 @@ class SegmentationConfig:
     join_m: float = 0.15  # if one is this near
     flat_m: float = 0.15  # a cluster that lies this close to a floor or wall is a part of it
     flat_share: float = 0.9  # with this share of its voxels
+    strip_m: float = 1.0  # so is a longer one that lies this close to any of several
     top_area_m2: float = 0.08  # of a level that something may stand on: a table top, the floor
     top_m: float = 0.03  # how far from its height its voxels lie
     foot_m: float = 0.1  # a thing stands by what of it lies this close above the level,

@@ -199,6 +199,17 @@ def test_a_wall_that_bends_off_its_plane_is_no_object():
     assert agreement(found.instance, truth) > 0.75
 
 
+def test_a_strip_that_drift_leaves_in_a_corner_is_no_object():
+    rng = np.random.default_rng(13)
+    along = rectangle([0.07, 0.3, 0.07], [0.09, 2.7, 0.09], 3000, rng)
+    across = rectangle([0.07, 0.3, 0.07], [0.09, 0.5, 1.5], 6000, rng)
+    foot = rectangle([0.07, 0.3, 0.06], [0.6, 2.7, 0.08], 9000, rng)
+    points, truth = room(box([2, 2, 0.36], 0.7, rng), np.concatenate([along, across, foot]))
+    found = segment_geometric(points, CONFIG).instance
+    assert found.max() == 1
+    assert not found[truth == 2].any()
+
+
 @pytest.mark.parametrize("spacing_m", [0.01, 0.03, 0.06])
 def test_the_spacing_of_the_points_decides_what_touches(spacing_m: float):
     """Two sheets 0.25 m apart: two instances, each whole, whether points are dense or sparse."""
