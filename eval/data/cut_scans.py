@@ -27,8 +27,7 @@ MOSTLY = 0.5  # share of an instance's points that makes it a part of an object
 def with_cuts(scene: KnownScene, cut: Cut) -> KnownScene:
     """The scene without its masks: every scan read from its file and cut anew.
 
-    Scans that `changes` refuses are cut by `geometric`, as its message says. Raises ValueError for a scene whose files
-    have no vertex of each object beside them.
+    Raises ValueError for a scene whose files have no owner of every vertex beside them.
     """
     if not scene.true_points:
         raise ValueError(
@@ -47,11 +46,8 @@ def with_cuts(scene: KnownScene, cut: Cut) -> KnownScene:
 def instances_of(clouds: list[LabeledCloud], cut: Cut) -> list[np.ndarray]:
     """The instance of every point of every scan."""
     if cut == "changes":
-        try:
-            scans = [UnlabeledScan(points=c.points, normals=c.normals) for c in clouds]
-            return [s.instance for s in segment_changes(scans)]
-        except ValueError:  # they do not lie on one another
-            pass
+        scans = [UnlabeledScan(points=c.points, normals=c.normals) for c in clouds]
+        return [s.instance for s in segment_changes(scans)]
     return [segment_geometric(c.points, SegmentationConfig()).instance for c in clouds]
 
 

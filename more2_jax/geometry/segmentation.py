@@ -124,7 +124,7 @@ def without_flat(
                 False
             )
         flat |= of_one
-    for k in np.flatnonzero(mostly(near.any(axis=0)) & ~flat):
+    for k in np.flatnonzero(mostly(np.logical_or.reduce(near, axis=0)) & ~flat):
         flat[k] = extent(voxels[cluster == k]) > config.strip_m
     cluster[np.append(flat, False)[cluster]] = -1  # the last is that of -1
     return cluster

@@ -58,8 +58,8 @@ def read_changed_scans(
 
     `earlier` are scans of the room that are only compared with. `masks` are none, or one a path (None: that scan has
     none); scans that have instances keep them. The rest is as in `read_scan`: meters, each in its own frame.
-    Raises ValueError, in one line, for fewer than two scans in all, for one that fits no other, where no instance is
-    left, and for what `read_scan` refuses.
+    One that fits no other is cut alone, and its warnings say so. Raises ValueError, in one line, for fewer than two
+    scans in all, where no instance is left, and for what `read_scan` refuses.
     """
     check_told(unit, up)
     every = [Path(p) for p in (*earlier, *paths)]

@@ -42,6 +42,10 @@ MOST = 0.5  # share of a cluster's voxels on the side of what changed: it is no 
 CHANGED = (
     0.4  # share of an instance's voxels that another scan shows empty, from which it is said to have changed
 )
+ALONE = (
+    "it does not lie on the other scans in any one pose, and is cut as by --segment geometric; changes between scans"
+    " need scans that show the same floor and walls, each with z up or all in one frame"
+)
 CAPACITY = 100  # of the whole-numbered flow, for a weight of 1
 
 
@@ -72,10 +76,14 @@ class TemporalSegmentation(Segmentation):
 
     emptied: Float[np.ndarray, " k"]  # share of each instance's voxels that another scan shows empty
     changed: Bool[np.ndarray, " k"]  # of instances 1 to k
-    T_first_scan: Pose  # how the scan lies in the first one's frame
+    T_first_scan: (
+        Pose | None
+    )  # how the scan lies in the first one's frame; None: it lies on none in any one pose
 
     def sentences(self) -> tuple[str, ...]:
         """What changed, and what was removed and kept, in words."""
+        if self.T_first_scan is None:
+            return (ALONE, *super().sentences())
         ids = ", ".join(str(k) for k in np.flatnonzero(self.changed) + 1)
         return (f"instances that changed between scans: {ids or 'none'}", *super().sentences())
 
@@ -85,9 +93,10 @@ def segment_changes(
 ) -> tuple[TemporalSegmentation, ...]:
     """Cuts scans of one room, each into instances of its own, by what changed between them.
 
-    Scans lie in any frames: as given where they fit, else leveled and turned until they do (`one_frame`). Ids are
-    those of one scan: who is who is left to matching. What a scan did not look at is no change.
-    Raises ValueError for fewer than two scans, an empty one, one that fits no other, and one too wide for the grid.
+    Scans lie in any frames: as given where they fit, else leveled and turned until they do (`one_frame`). One that
+    fits none is cut alone, and nothing of it is said to have changed. Ids are those of one scan: who is who is left to
+    matching. What a scan did not look at is no change.
+    Raises ValueError for fewer than two scans, an empty one, and one too wide for the grid.
     """
     config = config or ChangeConfig()
     if len(scans) < 2 or not all(len(s.points) for s in scans):
@@ -99,21 +108,21 @@ def segment_changes(
     surfaces = [surface_of(s, config.clusters.voxel_m) for s in scans]
     empty = [empty_before(s) for s in surfaces]
     found = []
-    for k, surface in enumerate(surfaces):
+    for k, (surface, T) in enumerate(zip(surfaces, poses, strict=True)):
         said = [
-            states(surface, surfaces[j], np.linalg.inv(poses[j]) @ poses[k], empty[j])
-            for j in range(len(scans))
-            if j != k
+            states(surface, surfaces[j], np.linalg.inv(other) @ T, empty[j])
+            for j, other in enumerate(poses)
+            if j != k and T is not None and other is not None
         ]
-        found.append(_instances(surface, together(said), poses[k], config))
+        found.append(_instances(surface, together(said, len(surface.points)), T if said else None, config))
     return tuple(found)
 
 
-def one_frame(clouds: Sequence[Points]) -> list[Pose]:
+def one_frame(clouds: Sequence[Points]) -> list[Pose | None]:
     """`T_first_scan` of every scan (meters), by the first or another that is placed already.
 
-    Frames as they are given are believed wherever they fit; only scans left over are turned.
-    Raises ValueError where one fits none of the placed ones.
+    Frames as they are given are believed wherever they fit; only scans left over are turned. None of a scan that fits
+    none of the placed ones.
     """
     shapes = [room_shape(p) for p in clouds]
     poses: dict[int, Pose] = {0: np.eye(4)}
@@ -124,13 +133,10 @@ def one_frame(clouds: Sequence[Points]) -> list[Pose]:
         pairs = [(j, k) for k in left for j in sorted(poses, key=lambda j: abs(j - k))]
         fits = ((j, k, _placed(way, shapes[j], shapes[k])) for way in ways for j, k in pairs)
         if (found := next(((j, k, f) for j, k, f in fits if f is not None), None)) is None:
-            raise ValueError(
-                f"scan {left[0] + 1} of {len(clouds)} does not lie on the others in any one pose; changes between"
-                " scans need scans that show the same floor and walls, each with z up or all in one frame"
-            )
+            break
         j, k, fit = found
         poses[k] = poses[j] @ fit.T_a_b
-    return [poses[k] for k in range(len(clouds))]
+    return [poses.get(k) for k in range(len(clouds))]
 
 
 def _placed(
@@ -139,16 +145,17 @@ def _placed(
     return None if a is None or b is None else way(a, b)
 
 
-def together(said: Sequence[Int8[np.ndarray, " v"]]) -> Int8[np.ndarray, " v"]:
+def together(said: Sequence[Int8[np.ndarray, " v"]], count: int) -> Int8[np.ndarray, " v"]:
     """What several scans say of a scan's voxels: emptied in one of them, else there in one of them, else unknown."""
-    state = np.full_like(said[0], UNKNOWN)
+    state = np.full(count, UNKNOWN, np.int8)
     for value in (STAYED, EMPTIED):
-        state[np.any([s == value for s in said], axis=0)] = value
+        for one in said:
+            state[one == value] = value
     return state
 
 
 def _instances(
-    surface: Surface, state: Int8[np.ndarray, " v"], T_first_scan: Pose, config: ChangeConfig
+    surface: Surface, state: Int8[np.ndarray, " v"], T_first_scan: Pose | None, config: ChangeConfig
 ) -> TemporalSegmentation:
     """Floor and walls removed; what changed and what stayed clustered, each for itself."""
     clusters, points = config.clusters, surface.points

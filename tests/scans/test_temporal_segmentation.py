@@ -139,7 +139,7 @@ def test_each_scan_may_lie_in_a_frame_of_its_own():
     (a, _), (b, in_b) = visit(0, FROM), visit(1, TO)
     turn = Rotation.from_euler("zx", [110.0, 3.0], degrees=True)
     found = segment_changes([a, moved_by(b, turn, [-7.0, 2.0, 1.0])])[1]
-    T = found.T_first_scan
+    assert (T := found.T_first_scan) is not None
     assert np.abs(T[:3, :3] @ turn.as_matrix() - np.eye(3)).max() < 0.01
     which, overlap = best(found.instance, in_b == 2)
     assert overlap > 0.8
@@ -206,18 +206,29 @@ def test_the_cut_keeps_to_the_crease():
 
 
 def test_refuses_what_it_cannot_compare():
-    (a, _), (b, _) = visit(0, FROM), visit(1, TO)
+    a, _ = visit(0, FROM)
     with pytest.raises(ValueError, match=r"1 scans .* need two or more"):
         segment_changes([a])
     with pytest.raises(ValueError, match="none empty"):
         segment_changes([a, UnlabeledScan(points=np.zeros((0, 3)))])
+
+
+def test_a_scan_that_lies_on_none_is_cut_alone():
+    """And does not disturb those that lie on one another."""
+    (a, _), (b, _) = visit(0, FROM), visit(1, TO)
     rng = np.random.default_rng(3)
     other = UnlabeledScan(
         points=np.concatenate([panel(rng, [0, 0, 0], [2, 2, 0]), box(rng, [1, 1, 0.4], [0.8] * 3)])
     )
     upside = moved_by(other, Rotation.from_euler("x", 180, degrees=True), [40.0, 0, 0])
-    with pytest.raises(ValueError, match="scan 2 of 2 does not lie on the others"):
-        segment_changes([b, upside])
+    *together, alone = segment_changes([a, b, upside])
+    assert alone.T_first_scan is None
+    assert not alone.changed.any()
+    assert "does not lie on the other scans" in alone.sentences()[0]
+    geometric = segment_geometric(upside.points, SegmentationConfig()).instance
+    np.testing.assert_array_equal(alone.instance > 0, geometric > 0)
+    for found, as_two in zip(together, segment_changes([a, b]), strict=True):
+        np.testing.assert_array_equal(found.instance, as_two.instance)
 
 
 def test_scans_are_placed_by_any_that_is_placed():
@@ -228,4 +239,4 @@ def test_scans_are_placed_by_any_that_is_placed():
         for side in (whole.points[:, 0] < 1.8, whole.points[:, 0] > 2.2)
     )
     poses = one_frame([left.points, right.points, whole.points])
-    assert all(np.abs(T - np.eye(4)).max() < 0.01 for T in poses)
+    assert all(T is not None and np.abs(T - np.eye(4)).max() < 0.01 for T in poses)
