@@ -67,7 +67,7 @@ def clustered(
     if len(voxels) <= config.core_neighbors:
         return np.full(len(voxels), -1), np.zeros(len(voxels), bool)
     near_m, core = touching(voxels, counts, config)
-    cluster = clusters_off_planes(voxels, near_m, core, planes, config)
+    cluster = clusters_off_planes(voxels, normals, near_m, core, planes, config)
     thing = things_on_tops(voxels, normals, cluster, near_m, planes, config)
     apart = thing >= 0
     return np.where(apart, thing + cluster.max(initial=-1) + 1, cluster), apart

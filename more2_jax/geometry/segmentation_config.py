@@ -24,6 +24,7 @@ class SegmentationConfig:
     link_spacing: float = 1.0  # where points are sparse: times the distance of the last core neighbor
     largest_link_m: float = 0.2
     beside_m: float = 0.12  # what lies this close to a floor or wall joins no two parts,
+    beside_deg: float = 45.0  # and whose normal turns less than this from the plane's,
     beside_reach_m: float = 0.2  # and belongs to a part that it touches along this way
     core_neighbors: int = 9  # fewer within reach: a voxel joins no two parts
     join_area_m2: float = 0.1  # a smaller cluster is a piece of a neighbor

@@ -16,6 +16,7 @@ from more2_jax.geometry.segmentation_config import SegmentationConfig
 
 def clusters_off_planes(
     voxels: Float[np.ndarray, "v 3"],
+    normals: Float[np.ndarray, "v 3"],
     near_m: csr_matrix,
     core: Bool[np.ndarray, "v"],
     planes: Sequence[Plane],
@@ -27,9 +28,7 @@ def clusters_off_planes(
     are structure belongs to the part that it touches on a short way; the rest of it is clustered by itself.
     """
     cluster = np.full(len(voxels), -1)
-    beside = np.zeros(len(voxels), bool)
-    for plane in (p for p in planes if p.structure):
-        beside |= np.abs(voxels @ plane.normal - plane.offset_m) < config.beside_m
+    beside = beside_planes(voxels, normals, planes, config)
     _connect(cluster, near_m, core & ~beside)
     if (cluster >= 0).any() and beside.any():
         off = np.flatnonzero(cluster >= 0)
@@ -39,6 +38,21 @@ def clusters_off_planes(
         cluster[reached] = cluster[begun[reached]]
     _connect(cluster, near_m, core & (cluster < 0))
     return _with_rim(voxels, cluster, core, config)
+
+
+def beside_planes(
+    voxels: Float[np.ndarray, "v 3"],
+    normals: Float[np.ndarray, "v 3"],
+    planes: Sequence[Plane],
+    config: SegmentationConfig,
+) -> Bool[np.ndarray, "v"]:
+    """Which voxels lie along a floor or wall, or near two: what stands before a wall faces other ways."""
+    along, near = np.zeros(len(voxels), bool), np.zeros(len(voxels), int)
+    for plane in (p for p in planes if p.structure):
+        of_plane = np.abs(voxels @ plane.normal - plane.offset_m) < config.beside_m
+        along |= of_plane & (np.abs(normals @ plane.normal) > np.cos(np.deg2rad(config.beside_deg)))
+        near += of_plane
+    return along | (near > 1)
 
 
 def touching(
