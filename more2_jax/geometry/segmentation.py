@@ -40,7 +40,8 @@ def segment_geometric(points: Float[np.ndarray, "n 3"], config: SegmentationConf
 
     A plane is floor, wall or ceiling if it is large, spans much of the scene, has nearly nothing beyond it, and
     is not just over or before another: no direction is taken for up, and a table top over a floor stays. How far
-    apart two voxels of one part may be grows where points are sparse, as far from a camera.
+    apart two voxels of one part may be grows where points are sparse, as far from a camera. Where a floor is seen and
+    z is up, what stands on the top of another part is an instance of its own.
     Raises ValueError for a cloud too wide for the voxel grid.
     """
     if not len(points):

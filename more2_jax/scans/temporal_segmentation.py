@@ -7,7 +7,7 @@ clustered as in `geometry.segmentation`.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -104,39 +104,48 @@ def segment_changes(
             f"{len(scans)} scans of {', '.join(str(len(s.points)) for s in scans) or 'no'} points; changes between"
             " scans need two or more, none empty"
         )
-    poses = one_frame([s.points for s in scans])
+    placed = one_frame([s.points for s in scans])
     surfaces = [surface_of(s, config.clusters.voxel_m) for s in scans]
     empty = [empty_before(s) for s in surfaces]
     found = []
-    for k, (surface, T) in enumerate(zip(surfaces, poses, strict=True)):
+    for k, (surface, (first, T)) in enumerate(zip(surfaces, placed, strict=True)):
         said = [
             states(surface, surfaces[j], np.linalg.inv(other) @ T, empty[j])
-            for j, other in enumerate(poses)
-            if j != k and T is not None and other is not None
+            for j, (its_first, other) in enumerate(placed)
+            if j != k and its_first == first
         ]
         found.append(_instances(surface, together(said, len(surface.points)), T if said else None, config))
     return tuple(found)
 
 
-def one_frame(clouds: Sequence[Points]) -> list[Pose | None]:
-    """`T_first_scan` of every scan (meters), by the first or another that is placed already.
+def one_frame(clouds: Sequence[Points]) -> list[tuple[int, Pose]]:
+    """Of every scan (meters) the first that it hangs together with, itself if there is none, and `T_first_scan`.
 
-    Frames as they are given are believed wherever they fit; only scans left over are turned. None of a scan that fits
-    none of the placed ones.
+    Frames as they are given are believed wherever they fit; only scans left over are turned.
     """
     shapes = [room_shape(p) for p in clouds]
-    poses: dict[int, Pose] = {0: np.eye(4)}
+    placed: dict[int, tuple[int, Pose]] = {}
+    for first in range(len(clouds)):
+        if first not in placed:
+            placed |= {k: (first, T) for k, T in _hanging_together(first, shapes, placed).items()}
+    return [placed[k] for k in range(len(clouds))]
+
+
+def _hanging_together(
+    first: int, shapes: Sequence[RoomShape | None], taken: Collection[int]
+) -> dict[int, Pose]:
+    """`T_first_scan` of the first scan and of those, not `taken`, that lie on it or on another that does."""
+    poses: dict[int, Pose] = {first: np.eye(4)}
     ways = (fit_as_given, fit_from_any_yaw)
-    while len(poses) < len(clouds):
-        left = [k for k in range(len(clouds)) if k not in poses]
+    while True:
+        left = [k for k in range(len(shapes)) if k not in poses and k not in taken]
         # The nearest in time first: scans that follow one another have most in common.
         pairs = [(j, k) for k in left for j in sorted(poses, key=lambda j: abs(j - k))]
         fits = ((j, k, _placed(way, shapes[j], shapes[k])) for way in ways for j, k in pairs)
         if (found := next(((j, k, f) for j, k, f in fits if f is not None), None)) is None:
-            break
+            return poses
         j, k, fit = found
         poses[k] = poses[j] @ fit.T_a_b
-    return [poses.get(k) for k in range(len(clouds))]
 
 
 def _placed(

@@ -159,7 +159,7 @@ def test_a_pillow_on_the_floor_is_a_thing_and_a_rug_is_not(rises_m: float, thing
     points, truth = room(p)
     found = segment_geometric(points, CONFIG).instance
     assert found.max() == things
-    assert not found[truth == 0].any() or things
+    assert (found[truth == 0] > 0).mean() < 0.01
 
 
 def test_what_is_left_of_a_wall_joins_no_two():
