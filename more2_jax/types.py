@@ -285,6 +285,8 @@ class Frame:
     T_scene_scan: Float[np.ndarray, "4 4"] = field(default_factory=lambda: np.eye(4))  # float64, row-major
     sigma_m: float = 0.0  # standard errors of what it makes of a place and of a direction; 0 where it was
     sigma_deg: float = 0.0  # taken as given
+    # How far its surfaces lie off those of the scene that it shows again: noise, and drift; 0 where it is not known.
+    noise_m: float = 0.0
     # Does not fit those before as given, and nothing tells how it lies: what moved, and how far, is in doubt.
     unknown: bool = False
 

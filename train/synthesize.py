@@ -71,6 +71,8 @@ class Settings:
     """Of regime real: 14 to 24 objects a room, sets that are alike, small things on furniture."""
     reshaped: float = 0.0
     """Of regime real: share of the objects that have another shape at every visit after the first."""
+    noise: float = 1.0
+    """Of regime real: how many times the usual the device's noise and drift are."""
     room_m: tuple[float, float] | None = None
     """Floor, x by y; 7 by 6 without, in regime real as the furniture needs."""
     cache: Path | None = None
@@ -128,6 +130,7 @@ def job_of(s: Settings, unreadable: dict[str, str]) -> Job:
         masks=masks,
         lived_in=crowded,
         reshaped=_reshaped(s),
+        noise=_noise(s),
     )
 
 
@@ -167,6 +170,13 @@ def _reshaped(s: Settings) -> float:
     return s.reshaped
 
 
+def _noise(s: Settings) -> float:
+    """Raises ValueError if it is no factor, or the regime has no such device."""
+    if not 0 <= s.noise < np.inf or (s.noise != 1 and s.regime != "real"):
+        raise ValueError(f"noise {s.noise}, regime {s.regime}; needed a factor from 0, in regime real")
+    return s.noise
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)  # itself alone is equal: what is read for it is kept
 class Job:
     """Everything that scenes depend on, but their number."""
@@ -182,6 +192,7 @@ class Job:
     masks: Masks = "perfect"
     lived_in: bool = False
     reshaped: float = 0.0
+    noise: float = 1.0
 
     @cached_property
     def facts(self) -> dict[str, Any]:
@@ -198,6 +209,7 @@ class Job:
             **({"masks": self.masks} if self.regime == "real" else {}),
             **({"lived_in": True} if self.lived_in else {}),
             **({"reshaped": self.reshaped} if self.reshaped else {}),
+            **({"noise": self.noise} if self.noise != 1 else {}),
         }
 
 
@@ -273,7 +285,7 @@ def _furnished(
             room_m=job.room_m,
             things_on_furniture=job.lived_in,
             reshaped=job.reshaped,
-            scanned=ScanSettings(masks=job.masks),
+            scanned=ScanSettings(masks=job.masks).with_noise(job.noise),
         )
         return real_scene(chosen, config, rng, name)
     config = scene_config(job.regime, job.scans, rng, free=job.free)

@@ -231,6 +231,14 @@ def known_of(
     }
 
 
+def measured_within(aligned: AlignedPairs, apart_m: float) -> AlignedPairs:
+    """The same, distances between clouds and what lies around them truncated at `apart_m` (`metric_evidence`)."""
+    sides, rows = aligned.ends, aligned.rows[:, ::-1]
+    samples = samples_of(sides[0].ready, sides[0].origins), samples_of(sides[1].ready, sides[1].origins)
+    metric = metric_evidence(aligned.sides, samples, rows, aligned.T_old_new, aligned.seen, apart_m)
+    return dataclasses.replace(aligned, metric=metric)
+
+
 def told_by_prior(
     prior: Prior,
     ready: tuple[AlignableObject, AlignableObject],

@@ -21,6 +21,8 @@ from more2_jax.registration.search import AlignableObject
 from more2_jax.types import ObservedObject
 
 APART_M = 0.08  # a point farther from the other cloud counts as this far; chosen as `seen_space.CELL_M`
+# So many times the noise where scans have more than usual, and at most: docs/developing/notebook/scan_noise.md.
+NOISES, MOST_APART_M = 4.0, 0.16
 
 Samples = list[Float[np.ndarray, "_ 3"]]
 Seen = tuple[SeenSpace, SeenSpace]  # of the scene so far, and of the new scan, each in its own frame
@@ -45,7 +47,7 @@ class MetricEvidence:
 
     apart: Float[
         np.ndarray, "p k 2"
-    ]  # mean distances of source and target, shares of `APART_M` that truncates them
+    ]  # mean distances of source and target, shares of what truncates them (`apart_within`)
     contradicted: Float[
         np.ndarray, "p k"
     ]  # the larger of the shares of both that lie in the other's empty space
@@ -57,11 +59,12 @@ def metric_evidence(
     pairs: Int[np.ndarray, "p 2"],
     T_old_new: Float[np.ndarray, "p k 4 4"],
     seen: Seen | None,
+    apart_m: float = APART_M,
 ) -> MetricEvidence:
     """Compares samples of instances and objects with the other cloud and what lies around it, and with the other scan.
 
     `sides`, `samples`: of instances (new scan's frame), then of objects (scene's frame). `pairs`: rows of both.
-    Without `seen` nothing is known to be empty.
+    Without `seen` nothing is known to be empty. `apart_m` truncates distances.
     """
     apart = np.zeros((*T_old_new.shape[:2], 2))
     empty = np.zeros_like(apart)
@@ -73,7 +76,7 @@ def metric_evidence(
             for n in rows.tolist():
                 poses = T_old_new[n] if way == 0 else np.linalg.inv(T_old_new[n])
                 moved = np.concatenate([apply_pose(T, samples[way][pairs[n, way]]) for T in poses])
-                off = shares_off(tree, moved)
+                off = shares_off(tree, moved, apart_m)
                 apart[n, :, way] = off.reshape(len(poses), -1).mean(axis=1)
                 if seen is not None:
                     far = off == 1.0  # what lies near the other cloud lies near something that its scan saw
@@ -94,7 +97,12 @@ def samples_of(ready: AlignableObject, origin: Float[np.ndarray, "b 3"]) -> Samp
     return [points[k][mask[k]] + origin[k] for k in range(len(points))]
 
 
-def shares_off(tree: KDTree, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
-    """Distances of points from a cloud, truncated at `APART_M` and as shares of it."""
-    nearest, _ = tree.query(points, distance_upper_bound=APART_M)
-    return np.minimum(nearest / APART_M, 1.0)
+def shares_off(tree: KDTree, points: Float[np.ndarray, "n 3"], apart_m: float) -> Float[np.ndarray, " n"]:
+    """Distances of points from a cloud, truncated at `apart_m` and as shares of it."""
+    nearest, _ = tree.query(points, distance_upper_bound=apart_m)
+    return np.minimum(nearest / apart_m, 1.0)
+
+
+def apart_within(noise_m: float) -> float:
+    """What truncates distances of scans with so much noise, meters."""
+    return min(max(APART_M, NOISES * noise_m), MOST_APART_M)

@@ -53,14 +53,14 @@ STAYED_RATIO, STAYED_OFFSET = 1.1, 0.01
 # A center that is shifted by less, a share of the radius, has not moved; a turn by less may be an error; what a turn in
 # place must fit better than no motion.
 IN_PLACE, NOT_TURNED_DEG, TURNED_RATIO, TURNED_OFFSET = 0.25, 15.0, 1.2, 0.01
-# Of what both scans show where it stood: the truncation of distances, whatever its size, and how many times those of
-# another pose its distances may be (docs/developing/notebook/still_standing.md).
-STANDING_M, STANDING_RATIO = 0.03, 1.3
+# Of what both scans show where it stood: how many times those of another pose its distances may be
+# (docs/developing/notebook/still_standing.md).
+STANDING_RATIO = 1.3
 FINE = 0.25  # share of the truncation: the nearer one by which refined poses are told apart
 TURNED_DEG = 15.0  # competing poses differ by more
 
-# "It did not move", and whether both scans show surfaces where the other has the object.
-Stayed = tuple[jaxlie.SE3, Bool[Array | np.ndarray, "*batch"]]
+# "It did not move", and how near both scans show surfaces where the other has the object, 0 where they do not.
+Stayed = tuple[jaxlie.SE3, Float[Array | np.ndarray, "*batch"]]
 
 
 def register_by_surfaces(
@@ -73,7 +73,7 @@ def register_by_surfaces(
     candidates = pairs.candidates
     if candidates is None:
         candidates = search_poses(source, target, pairs.stayed, settings.search, motion).poses
-    standing = jnp.zeros(len(pairs), bool) if pairs.standing is None else pairs.standing
+    standing = jnp.zeros(len(pairs)) if pairs.stands_within_m is None else pairs.stands_within_m
     return refine_poses(prior, (source, target), candidates, (pairs.stayed, standing), settings, motion)
 
 
@@ -134,7 +134,7 @@ def refine_pair(
     doubt = prior_cost(prior, poses, costs, (source, target), settings)
     moved = motion_since(stayed, poses, masked_mean(s.sampled.points, s.sampled.mask))
     best, costs = decided(costs, doubt, moved, settings.try_stayed)
-    best = where_it_stands(best, held[1] & settings.try_stayed, poses, (s, t), STANDING_M / radius)
+    best = where_it_stands(best, held[1] / radius * settings.try_stayed, poses, (s, t))
     T = jax.tree.map(lambda x: x[best], poses)
     T = aligned = polished(T, (source, target), misfits[best], settings, motion)
     if settings.try_stayed:  # what stayed is exactly where it was
@@ -259,23 +259,23 @@ def simplest(
 
 def where_it_stands(
     best: Array,
-    standing: Bool[Array | np.ndarray, ""],
+    within: Float[Array | np.ndarray, ""],
     poses: jaxlie.SE3,
     surfaces: tuple[Surface, Surface],
-    reach: Float[Array, ""],
 ) -> Array:
     """The chosen pose, or "it did not move" (the last) if both scans show surfaces there, and it is nearly as near.
 
-    Near by `reach`, not by a share of the radius: noise and drift do not shrink with the object, and what fits a small
-    thing closest may be no more than how noise lies in either scan.
+    `within`: so near they show them, which truncates distances; 0 where they do not. It is no share of the radius:
+    noise and drift do not shrink with the object, and what fits a small thing closest may be no more than how noise
+    lies in either scan.
     """
 
     def kept(best: Array) -> Array:
         two = jax.tree.map(lambda x: jnp.stack([x[-1], x[best]]), poses)
-        here, there = jax.vmap(lambda T: misfit(T, *surfaces, (reach,)))(two)
+        here, there = jax.vmap(lambda T: misfit(T, *surfaces, (jnp.asarray(within),)))(two)
         return jnp.where(here <= STANDING_RATIO * there, len(poses.wxyz_xyz) - 1, best)
 
-    return jax.lax.cond(standing, kept, lambda best: best, best)
+    return jax.lax.cond(within > 0, kept, lambda best: best, best)
 
 
 def simply(cost: Float[Array, ""]) -> Float[Array, ""]:

@@ -329,7 +329,8 @@ def _frame(content: dict[str, Any] | None) -> Frame:
         return Frame()
     T = np.array(content["T_scene_scan"], np.float64)
     sigma = {k: content[k] for k in ("sigma_m", "sigma_deg")}
-    return Frame(T_scene_scan=T, unknown=content.get("unknown", False), **sigma)
+    noise_m, unknown = content.get("noise_m", 0.0), content.get("unknown", False)
+    return Frame(T_scene_scan=T, noise_m=noise_m, unknown=unknown, **sigma)
 
 
 def _object(

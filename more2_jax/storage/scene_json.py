@@ -81,6 +81,7 @@ def _frame_to_json(frame: Frame, upright: bool) -> dict[str, Any]:
         "sigma_m": float(frame.sigma_m),
         "sigma_deg": float(frame.sigma_deg),
     }
+    content |= {"noise_m": float(frame.noise_m)} if frame.noise_m > 0 else {}
     content |= {"unknown": True} if frame.unknown else {}  # older readers know no such frame
     return content | ({"tilt_deg": frame.tilt_deg} if upright and frame.tilt_deg > 0 else {})
 

@@ -18,7 +18,8 @@ from more2_jax.network.embedding_batch import stack
 from more2_jax.network.prior import Prior
 from more2_jax.tracking.objects import SCENE_FRAME
 from more2_jax.tracking.rooms import Rooms
-from more2_jax.tracking.scan_frame import common_frame
+from more2_jax.tracking.scan_frame import among_noise, common_frame
+from more2_jax.tracking.scan_noise import with_noise
 from more2_jax.tracking.still_standing import lost_by_standing
 from more2_jax.types import Frame, ObservedObject, SceneObject
 
@@ -96,6 +97,8 @@ def by_evidence(
 ) -> Identified:
     """The assignment that surfaces find likeliest, with probabilities, and the frame of the scan."""
     frame, weighed = common_frame(prior, old, new, matcher, config.motion, rooms)
+    frame = with_noise(frame, rooms.scene_surfaces, rooms.scan)
+    weighed = among_noise(weighed, frame.noise_m, matcher, config.motion)
     aligned = weighed.aligned
     motion = motion_odds(aligned, frame.T_scene_scan, matcher, config.motion)
     pairs, lost = without_standing(

@@ -18,13 +18,13 @@ from scipy.spatial import KDTree
 from more2_jax.geometry.near_points import NearPoints, rms_radius
 from more2_jax.geometry.poses import Points, apply_pose
 from more2_jax.tracking.objects import accumulated_points, observation_in, place_of, points_of
+from more2_jax.tracking.scan_noise import near_m
 from more2_jax.tracking.surroundings import around
 from more2_jax.types import Frame, Scan, ScanRecord, SceneObject
 
 CELL_M = 0.15  # a side of a column of the place: scans hold a point every few centimeters
 SPACINGS = 4.0  # between neighboring points, that a side has at least: four points of a floor in a column
 STILL_THERE = 0.5  # share of an object's points that lie on a scan's surfaces: it stands there without a mask
-NEAR_M = 0.03  # of such a surface; the spacing of what is remembered of a scan, where that is wider
 ABOVE_M = 0.1  # over an object's top: points higher than that tell nothing of its place
 LOOKED_AT = 0.35  # share of the place that a scan must have looked at to miss the object
 LEAST_BACKGROUND = 200  # points: a scan of objects alone does not tell where it looked
@@ -50,7 +50,8 @@ def not_looked_at(
         for points in (scan.background, *(i.points for i in scan.instances)):
             yield apply_pose(frame.T_scene_scan, points)
 
-    unsure = cannot_tell([last_place(objects[k]) for k in missing], clouds, upright)
+    places = [last_place(objects[k]) for k in missing]
+    unsure = cannot_tell(places, clouds, upright, noise_m=frame.noise_m)
     return tuple(objects[k].id for k, u in zip(missing, unsure, strict=True) if u)
 
 
@@ -67,7 +68,8 @@ def not_looked_at_before(
         if not fresh or len(scan.background) < LEAST_BACKGROUND or scan.frame.unknown:
             break
         places, clouds = [last_place(o) for o in fresh], partial(clouds_of, objects, scan)
-        unsure = cannot_tell(places, clouds, upright, spacing_of(scan.background))
+        noise_m = max(scan.frame.noise_m, *(o.observations[-1].frame.noise_m for o in fresh))
+        unsure = cannot_tell(places, clouds, upright, spacing_of(scan.background), noise_m)
         fresh = [o for o, u in zip(fresh, unsure, strict=True) if u]
         unseen[scan.index] = tuple(o.id for o in fresh)
     return {index: ids for index, ids in unseen.items() if ids}
@@ -92,12 +94,17 @@ def clouds_of(objects: Sequence[SceneObject], scan: ScanRecord) -> Iterator[Poin
 
 
 def cannot_tell(
-    places: Sequence[Points], clouds: Callable[[], Iterator[Points]], upright: bool, spacing_m: float = 0.0
+    places: Sequence[Points],
+    clouds: Callable[[], Iterator[Points]],
+    upright: bool,
+    spacing_m: float = 0.0,
+    noise_m: float = 0.0,
 ) -> list[bool]:
     """Of objects at these places (scene's frame), whether a scan cannot tell that it lacks them.
 
     `clouds`: all that the scan shows, its background first. `spacing_m`: between neighboring points of that, where it
-    was thinned: columns, and what is near, are as wide as they need be.
+    was thinned, `noise_m`: between it and where the places were seen. Columns, and what is near, are as wide as they
+    need be.
     """
     if upright:
         room = Columns(clouds(), max(CELL_M, SPACINGS * spacing_m))
@@ -105,7 +112,7 @@ def cannot_tell(
     else:
         tree = KDTree(np.concatenate(list(clouds())))
         shares = [looked_at(p, tree) for p in places]
-    there = shares_still_there(places, clouds(), max(NEAR_M, spacing_m))
+    there = shares_still_there(places, clouds(), max(near_m(noise_m), spacing_m))
     return [seen < LOOKED_AT or still >= STILL_THERE for seen, still in zip(shares, there, strict=True)]
 
 

@@ -46,6 +46,11 @@ class Rooms:
         )
 
     @cached_property
+    def scene_surfaces(self) -> RoomShape | None:
+        """What is no object of the scene, at even spacing; None where that is too little, or too wide."""
+        return shape_of(self.scene, ())
+
+    @cached_property
     def near_given(self) -> RoomFit | None:
         """The pose near the one given at which the rooms fit; None where there is none, or one shows too little.
 

@@ -12,7 +12,8 @@ import numpy as np
 
 from more2_jax.config import EvidenceMatcher, MotionModel
 from more2_jax.geometry.poses import Points, Pose, apply_pose, vertical_shift
-from more2_jax.matching.candidates import align_candidates, odds_of
+from more2_jax.matching.candidates import align_candidates, measured_within, odds_of
+from more2_jax.matching.metric_evidence import APART_M, apart_within
 from more2_jax.matching.places import with_neighbors
 from more2_jax.matching.proposals import is_building, signatures
 from more2_jax.network.prior import Prior
@@ -96,6 +97,15 @@ def beside_one_another(
 ) -> Weighed:
     """The same with pairs that the frame lays beside each other, which nobody knew before."""
     aligned = with_neighbors(prior, weighed.aligned, matcher, motion, T_scene_scan)
+    odds = odds_of(aligned, matcher.search, motion, weighed.height_m)
+    return Weighed(height_m=weighed.height_m, aligned=aligned, odds=odds)
+
+
+def among_noise(weighed: Weighed, noise_m: float, matcher: EvidenceMatcher, motion: MotionModel) -> Weighed:
+    """The same with clouds compared as far as noise puts surfaces apart, where scans have more of it than usual."""
+    if (apart_m := apart_within(noise_m)) == APART_M:
+        return weighed
+    aligned = measured_within(weighed.aligned, apart_m)
     odds = odds_of(aligned, matcher.search, motion, weighed.height_m)
     return Weighed(height_m=weighed.height_m, aligned=aligned, odds=odds)
 

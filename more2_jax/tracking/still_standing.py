@@ -16,8 +16,9 @@ from more2_jax.geometry.poses import Points, Pose, apply_pose
 from more2_jax.matching.assignment import Chosen
 from more2_jax.matching.candidates import AlignedPairs
 from more2_jax.matching.places import OTHER_COLOR, few, stayed
-from more2_jax.tracking.looked_at import NEAR_M, shares_still_there, spacing_of
+from more2_jax.tracking.looked_at import shares_still_there, spacing_of
 from more2_jax.tracking.rooms import LEAST_BACKGROUND, Rooms
+from more2_jax.tracking.scan_noise import near_m
 from more2_jax.types import Frame
 
 # Chosen on rooms of regime `real` and `sparse`, and real captures: docs/developing/notebook/still_standing.md.
@@ -52,14 +53,15 @@ def lost_by_standing(
     # An object is looked for in the new scan, an instance in what was known before.
     scan = shown(rooms.scan, (o.points for o in new), T)
     before = shown(rooms.scene, (o.points for o in old), np.eye(4))
-    for side, (clouds_there, near_m) in enumerate(
-        ((scan, NEAR_M), (before, max(NEAR_M, remembered_spacing(rooms))))
+    near = near_m(frame.noise_m)
+    for side, (clouds_there, reach_m) in enumerate(
+        ((scan, near), (before, max(near, remembered_spacing(rooms))))
     ):
         other_color = of_other_color(aligned, side)
         but = [
             {other, *other_color[own]} for own, other in (pairs[n, [side, 1 - side]].tolist() for n in moved)
         ]
-        shares = shares_still_there([clouds[n][side] for n in moved], clouds_there, near_m, but)
+        shares = shares_still_there([clouds[n][side] for n in moved], clouds_there, reach_m, but)
         share = np.array(shares)
         lost[moved] += np.select(
             [share >= SURELY_STANDING, share >= LEAST_STANDING], [SURELY_STANDS, STANDS], 0.0
@@ -83,10 +85,14 @@ def standing(
         return np.zeros(len(pairs), bool)
     objects = [few(known[k], POINTS) for k, _ in pairs]
     instances = [apply_pose(T, few(new[i], POINTS)) for _, i in pairs]
-    scan, before = shown(rooms.scan, new, T), shown(rooms.scene, known, np.eye(4))
+    scan, before, near = (
+        shown(rooms.scan, new, T),
+        shown(rooms.scene, known, np.eye(4)),
+        near_m(frame.noise_m),
+    )
     shares = (
-        shares_still_there(objects, scan, NEAR_M),
-        shares_still_there(instances, before, max(NEAR_M, remembered_spacing(rooms))),
+        shares_still_there(objects, scan, near),
+        shares_still_there(instances, before, max(near, remembered_spacing(rooms))),
     )
     return np.min(shares, axis=0) >= SURELY_STANDING
 

@@ -99,7 +99,13 @@ def looked_for(
         return list(joins)
     rows = [row for j in joins for row in (j.matched, j.part)]
     upright = compared.config.motion == "upright"
-    unsure = cannot_tell([places[row] for row in rows], clouds, upright, spacing_of(background))
+    unsure = cannot_tell(
+        [places[row] for row in rows],
+        clouds,
+        upright,
+        spacing_of(background),
+        compared.identified.frame.noise_m,
+    )
     return [j for j, a, b in zip(joins, unsure[::2], unsure[1::2], strict=True) if not a and not b]
 
 

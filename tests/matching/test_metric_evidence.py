@@ -10,11 +10,21 @@ from scipy.spatial import KDTree
 from more2_jax.config import EvidenceMatcher, SurfaceSearch
 from more2_jax.geometry.poses import apply_pose
 from more2_jax.matching.calibration import UPRIGHT
-from more2_jax.matching.candidates import align_candidates, evidence_at, odds_of
-from more2_jax.matching.metric_evidence import APART_M, metric_evidence, samples_of, seen_in
+from more2_jax.matching.candidates import align_candidates, evidence_at, measured_within, odds_of
+from more2_jax.matching.metric_evidence import (
+    APART_M,
+    MOST_APART_M,
+    NOISES,
+    apart_within,
+    metric_evidence,
+    samples_of,
+    seen_in,
+)
 from more2_jax.network.embedding_batch import embed
 from more2_jax.registration.pair_batch import local_batch
 from more2_jax.registration.search import alignable
+from more2_jax.tracking.scan_frame import among_noise
+from more2_jax.tracking.scan_height import Weighed
 from more2_jax.types import ObservedObject
 
 SEARCH = SurfaceSearch(points=64, dense=128, cells=8, turns=4, steps=2)
@@ -49,19 +59,24 @@ def scans(tiny_prior):
     return old, new
 
 
-def compare(scans, pairs, poses, seen):
+def compare(scans, pairs, poses, seen, apart_m=APART_M):
     old, new = scans
     batches = local_batch(new), local_batch(old)
     ready = tuple(alignable(b, SEARCH) for b in batches)
     samples = tuple(samples_of(r, b.origin) for r, b in zip(ready, batches, strict=True))
-    return metric_evidence((new, old), samples, np.array(pairs), np.array(poses), seen), batches, ready
+    return (
+        metric_evidence((new, old), samples, np.array(pairs), np.array(poses), seen, apart_m),
+        batches,
+        ready,
+    )
 
 
-def test_by_definition_of_every_pair_and_pose(scans):
+@pytest.mark.parametrize("apart_m", [APART_M, 0.15])
+def test_by_definition_of_every_pair_and_pose(scans, apart_m):
     old, new = scans
     seen = seen_in(old, new, floor(), floor())
     poses = np.stack([np.stack([UP, np.eye(4)])] * 2)
-    found, batches, ready = compare(scans, [[0, 0], [1, 0]], poses, seen)
+    found, batches, ready = compare(scans, [[0, 0], [1, 0]], poses, seen, apart_m)
     for p, (i, k) in enumerate([(0, 0), (1, 0)]):
         for q, T in enumerate((UP, np.eye(4))):
             shares = []
@@ -69,9 +84,10 @@ def test_by_definition_of_every_pair_and_pose(scans):
                 sampled = ready[way].coarse.sampled
                 own = np.asarray(sampled.points[row], np.float64)[np.asarray(sampled.mask[row])]
                 moved = apply_pose(X, own + batches[way].origin[row])
-                by_hand = np.minimum(KDTree(cloud.points).query(moved)[0] / APART_M, 1).mean()
+                distance = KDTree(cloud.points).query(moved)[0]
+                by_hand = np.minimum(distance / apart_m, 1).mean()
                 assert found.apart[p, q, way] == pytest.approx(by_hand, abs=1e-9)
-                shares.append(seen[way].empty(moved, APART_M).mean())
+                shares.append((seen[way].empty(moved, APART_M) & (distance >= apart_m)).mean())
             assert found.contradicted[p, q] == pytest.approx(max(shares))
 
 
@@ -147,3 +163,32 @@ def test_empty_space_lowers_the_odds_and_is_asked_upright_alone(tiny_prior, scan
     )
     assert free.seen is None and not free.metric.contradicted.any() and free.metric.apart.any()
     assert jnp.isfinite(odds_of(free, SEARCH, "free").value).all()
+
+
+def test_so_many_times_the_noise_is_near_within_bounds():
+    assert apart_within(0.0) == apart_within(APART_M / NOISES) == APART_M
+    assert apart_within(0.02) == pytest.approx(NOISES * 0.02)
+    assert apart_within(1.0) == MOST_APART_M
+
+
+def test_among_noise_pairs_are_compared_anew_at_the_same_poses(tiny_prior, scans):
+    matcher, rng = EvidenceMatcher(search=SEARCH), np.random.default_rng(0)
+    old, new = scans
+    noisy = [
+        dataclasses.replace(o, points=o.points + rng.normal(0, 0.03, o.points.shape).round(4)) for o in new
+    ]
+    aligned = align_candidates(
+        tiny_prior, old, noisy, matcher, "upright", None, seen_in(old, noisy, floor(), floor())
+    )
+    weighed = Weighed(height_m=0.01, aligned=aligned, odds=odds_of(aligned, SEARCH, "upright", 0.01))
+    again = measured_within(aligned, APART_M)
+    np.testing.assert_array_equal(again.metric.apart, aligned.metric.apart)
+    np.testing.assert_array_equal(again.metric.contradicted, aligned.metric.contradicted)
+    assert among_noise(weighed, 0.01, matcher, "upright") is weighed
+    wider = among_noise(weighed, 0.03, matcher, "upright")
+    np.testing.assert_array_equal(wider.aligned.T_old_new, aligned.T_old_new)
+    assert wider.height_m == weighed.height_m
+    alike = [tuple(pair) in {(0, 0), (1, 1)} for pair in wider.odds.pairs.tolist()]
+    gain = wider.odds.value - weighed.odds.value
+    assert (gain[alike] > 0.5).all()  # noise speaks less against what is one object
+    assert wider.odds.value[alike].min() > wider.odds.value[~np.array(alike)].max()

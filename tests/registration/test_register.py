@@ -26,7 +26,8 @@ from more2_jax.registration.pair_batch import batch_of, local_batch, pair_up
 from more2_jax.registration.pose_costs import APART_DEG, lowest_apart
 from more2_jax.registration.register_pairs import register
 from more2_jax.registration.search import alignable, scaled_pose
-from more2_jax.registration.surface import STANDING_M, where_it_stands
+from more2_jax.registration.surface import where_it_stands
+from more2_jax.tracking.scan_noise import NEAR_M
 from more2_jax.types import ObservedObject
 
 POINTS = 512  # of every cloud registered by surfaces here: compiled once a prior
@@ -173,9 +174,7 @@ def test_what_stands_is_held_where_another_pose_is_nearer_by_no_more_than_noise(
     surfaces = tuple(thinned(o.full(), 256) for o in ready)
     poses = jaxlie.SE3(jnp.concatenate([there.wxyz_xyz, pairs.stayed.wxyz_xyz]))
     for stands in (True, False):
-        chosen = where_it_stands(
-            jnp.asarray(0), jnp.asarray(stands), poses, surfaces, jnp.asarray(STANDING_M)
-        )
+        chosen = where_it_stands(jnp.asarray(0), jnp.asarray(stands * NEAR_M), poses, surfaces)
         assert int(chosen) == (1 if held and stands else 0)
 
 
@@ -183,7 +182,7 @@ def test_what_stands_is_found_elsewhere_where_it_lies_nearer(tiny_prior):
     clouds = furniture()[:2]
     poses = [pieces.random_pose(np.random.default_rng(k), upright=False) for k in range(2)]
     pairs = pairs_of(tiny_prior, clouds_of(clouds), clouds_of(moved(clouds, poses)))
-    pairs = dataclasses.replace(pairs, standing=np.ones(len(pairs), bool))
+    pairs = dataclasses.replace(pairs, stands_within_m=np.full(len(pairs), NEAR_M))
     found = pairs.to_world(register(tiny_prior, pairs, SURFACE, "free").T_target_source)
     assert_recovered(found, poses, clouds)
 

@@ -74,12 +74,12 @@ def test_normals_of_anchors_come_back_and_unknown_ones_take_no_place(tmp_path, n
     assert_same(scene, load_scene(tmp_path / "scene")[0])
 
 
-@pytest.mark.parametrize("unknown", [False, True])
-def test_the_frame_of_a_scan_is_that_of_its_observations(tmp_path, unknown):
+@pytest.mark.parametrize(("unknown", "noise_m"), [(False, 0.0), (False, 0.02), (True, 0.0)])
+def test_the_frame_of_a_scan_is_that_of_its_observations(tmp_path, unknown, noise_m):
     scene = living_scene()
     T = np.eye(4)
     T[1:3, 1:3] = [[0.0, -1.0], [1.0, 0.0]]  # a quarter turn about x
-    frame = Frame(T_scene_scan=T, sigma_m=0.01, sigma_deg=0.2, unknown=unknown)
+    frame = Frame(T_scene_scan=T, sigma_m=0.01, sigma_deg=0.2, noise_m=noise_m, unknown=unknown)
     assert frame.tilt_deg == 90.0
     scans = (*scene.scans[:2], dataclasses.replace(scene.scans[2], frame=frame))
     objects = tuple(
@@ -96,6 +96,7 @@ def test_the_frame_of_a_scan_is_that_of_its_observations(tmp_path, unknown):
     tilts = [s["frame"].pop("tilt_deg", 0.0) for s in content["scans"]]
     assert tilts == [s.frame.tilt_deg for s in again.scans]
     assert [s["frame"].get("unknown") for s in content["scans"]] == [None, None, unknown or None]
+    assert [s["frame"].get("noise_m") for s in content["scans"]] == [None, None, noise_m or None]
     (tmp_path / "scene/scene.json").write_text(json.dumps(content))  # as written before tilts were
     assert_same(scene, load_scene(tmp_path / "scene")[0])
     for s in content["scans"]:

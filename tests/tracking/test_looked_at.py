@@ -283,6 +283,16 @@ def test_a_wall_behind_it_and_the_floor_under_it_are_not_its_surface():
     assert missed(floor([0, 0], [4, 3], count=8000), o=low) == ()
 
 
+@pytest.mark.parametrize(("noise_m", "there"), [(0.0, False), (0.01, False), (0.03, True)])
+def test_among_noise_a_surface_that_lies_farther_off_is_still_it(noise_m, there):
+    o = new_object(0, 0, Instance(id=1, points=CABINET), CODE)
+    frame, off = Frame(noise_m=noise_m), surface([1.6, 0.7, 0.0], [2.4, 1.3, 0.8]) + 0.05
+    assert not_looked_at([o], [0], scan(THERE, off), frame, True) == (ID if there else ())
+    new = new_object(0, 1, Instance(id=1, points=CABINET), CODE, frame)
+    unseen = not_looked_at_before([], [new], records(np.concatenate([THERE, off])), True)
+    assert unseen == ({0: ID} if there else {})
+
+
 def test_half_of_it_says_so_and_many_places_are_told_as_one_by_one():
     def clouds(share):
         yield THERE

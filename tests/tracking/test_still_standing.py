@@ -180,6 +180,14 @@ def test_what_moved_does_not_stand(shift_m):
     assert held([box(0, HERE)], [box(1, np.add(HERE, [shift_m, 0.0, 0.0]))]) == [False]
 
 
+@pytest.mark.parametrize(("noise_m", "stands"), [(0.0, False), (0.012, False), (0.03, True)])
+def test_among_noise_what_lies_farther_off_stands_as_well(noise_m, stands):
+    clouds, frame = ([box(0, HERE)], [box(1, np.add(HERE, 0.05))]), Frame(noise_m=noise_m)
+    assert held(*clouds, frame=frame) == [stands]
+    gone = [box(0, HERE)], [box(1, THERE), box(2, np.add(HERE, 0.05))]
+    assert lost(*gone, frame=frame) == ([SURELY_STANDS] if stands else [0.0])
+
+
 def test_nothing_stands_in_a_scan_of_unknown_frame_and_of_no_pairs_there_is_none():
     c, s = np.cos(0.7), np.sin(0.7)
     T = np.array([[c, -s, 0, 2.0], [s, c, 0, -1.0], [0, 0, 1, 0.1], [0, 0, 0, 1]])

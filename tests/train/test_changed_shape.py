@@ -108,6 +108,15 @@ def test_other_shares_and_regimes_are_refused(tmp_path, regime, reshaped):
         synthesize.main(settings)
 
 
+@pytest.mark.parametrize(("regime", "noise"), [("real", -1.0), ("real", np.inf), ("sparse", 2.0)])
+def test_noise_that_is_no_factor_and_of_other_regimes_is_refused(tmp_path, regime, noise):
+    source = tmp_path / "models.npz"
+    write_packed(source, MODELS)
+    settings = synthesize.Settings(source=source, regime=regime, out=tmp_path / "out", noise=noise)
+    with pytest.raises(ValueError, match=f"noise {noise}, regime {regime}; needed a factor from 0"):
+        synthesize.main(settings)
+
+
 def test_without_the_option_nothing_is_drawn(monkeypatch):
     plain = made()
     monkeypatch.setattr(real_visits, "_changes", lambda room, config, rng: ({},) * config.scans)

@@ -31,6 +31,17 @@ class ScanSettings:
     kept_faces: tuple[float, float] = (0.4, 0.8)  # share that decimation leaves, least and most
     masks: Masks = "perfect"
 
+    def with_noise(self, factor: float) -> ScanSettings:
+        """The same with so many times the noise of depth, and the drift of every frame."""
+        sensor, walk = self.sensor, self.walk
+        return replace(
+            self,
+            sensor=replace(
+                sensor, noise_m=factor * sensor.noise_m, noise_per_m2=factor * sensor.noise_per_m2
+            ),
+            walk=replace(walk, step_m=factor * walk.step_m, step_deg=factor * walk.step_deg),
+        )
+
 
 @dataclass(frozen=True, kw_only=True)
 class FusedScan:
