@@ -30,7 +30,7 @@ from eval.scores.mended_masks import with_added_masks, with_divided_masks
 from eval.scores.temporal_ap import temporal_records
 from eval.scores.told_chances import FIGURES as CHANCES
 from eval.scores.told_chances import told_chances
-from eval.scores.tracks import Track, changes_f1, false_changes, score_tracks, tracks_of
+from eval.scores.tracks import Track, changes_f1, false_changes, score_tracks, tracks_of, without_loose
 from more2_jax.config import EvidenceMatcher, SceneConfig
 from more2_jax.network.on_devices import at_hand
 from more2_jax.network.prior import Prior
@@ -160,7 +160,7 @@ def records_of(
         tracks, reason = [], str(error)
     else:
         reason = ""
-    taken = told(clock() - began)
+    taken, tracks = told(clock() - began), without_loose(scene, tracks)
     followed = temporal_records(scene, tracks)
     scene, tracks = with_divided_masks(scene, tracks)
     false: list[Record] = [{"false_change": x} for x in false_changes(scene, tracks)]

@@ -10,6 +10,7 @@ import numpy as np
 
 from eval.data.masks import LOST, best_masks
 from eval.data.truth import KnownObject, KnownScene
+from more2_jax.geometry.poses import Points, Pose, apply_pose
 from more2_jax.geometry.segmentation import segment_geometric
 from more2_jax.geometry.segmentation_config import SegmentationConfig
 from more2_jax.scans.labeled_cloud import LabeledCloud, ReadOptions
@@ -21,7 +22,9 @@ from more2_jax.types import Instance, Scan
 Cut = Literal["geometric", "changes"]
 CUTS: tuple[Cut, ...] = ("geometric", "changes")
 LEAST_POINTS = 64  # of an instance, as `more2 run` has it
-MOSTLY = 0.5  # share of an instance's points that makes it a part of an object
+MOSTLY = 0.5  # share of an instance's points that makes it a part of an object, or loose
+# Rooms of regime `real` have nothing on their walls and floors that reaches so far into them, drift included.
+WALL_M, FLOOR_M = 0.12, 0.04
 
 
 def with_cuts(scene: KnownScene, cut: Cut) -> KnownScene:
@@ -40,7 +43,30 @@ def with_cuts(scene: KnownScene, cut: Cut) -> KnownScene:
     )
     own = [shown_by(scene.true_points[k], scan) for k, scan in enumerate(scans)]
     objects = tuple(_with_instances(o, own) for o in scene.objects)
-    return dataclasses.replace(scene, scans=scans, objects=objects)
+    loose = tuple(
+        loose_instances(scan, scene.true_points[k], T, scene.room_m)
+        for k, (scan, T) in enumerate(zip(scans, scene.T_scan_room, strict=False))
+    )
+    return dataclasses.replace(scene, scans=scans, objects=objects, loose=loose)
+
+
+def loose_instances(
+    scan: Scan, true: dict[str, Points], T_scan_room: Pose, room_m: tuple[float, float]
+) -> frozenset[int]:
+    """Ids of instances that mostly show what is no known object and stands free in the room.
+
+    Such things are others at every visit (`train.rooms.surroundings`): to tell them as added or removed is right.
+    """
+    owned = {bytes(p) for points in true.values() for p in np.ascontiguousarray(points, np.float64)}
+    most = np.array([*room_m, np.inf]) / 2 - WALL_M
+
+    def is_loose(points: Points) -> bool:
+        free = np.array([bytes(p) not in owned for p in np.ascontiguousarray(points, np.float64)])
+        places = apply_pose(np.linalg.inv(T_scan_room), points)
+        inside = (np.abs(places) < most).all(axis=1) & (places[:, 2] > FLOOR_M)
+        return bool((free & inside).mean() > MOSTLY)
+
+    return frozenset(i.id for i in scan.instances if is_loose(i.points))
 
 
 def instances_of(clouds: list[LabeledCloud], cut: Cut) -> list[np.ndarray]:

@@ -74,6 +74,8 @@ def read_open(folder: Path) -> KnownScene:
         else (),
         looked_at=scene.looked_at,
         looked_at_next=scene.looked_at_next,
+        T_scan_room=scene.T_scan_room if scene.room_m else (),
+        room_m=scene.room_m or (0.0, 0.0),
     )
 
 

@@ -83,6 +83,11 @@ class KnownScene:
     # the next scan; (): not known.
     looked_at: tuple[dict[str, float], ...] = ()
     looked_at_next: tuple[dict[str, float], ...] = ()
+    # Of rooms with loose things that are no known object: T_scan_room by scan, and the floor, x by y; (): not known.
+    T_scan_room: tuple[Pose, ...] = ()
+    room_m: tuple[float, float] = (0.0, 0.0)
+    # By scan, ids of instances that show such things: what is told of them counts neither way.
+    loose: tuple[frozenset[int], ...] = ()
 
     def true_masks(self) -> tuple[dict[str, Points], ...] | None:
         """By scan, the points that are really each object's, by its name; in the scan's frame, meters.

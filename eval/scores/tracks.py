@@ -199,6 +199,13 @@ def true_changes(scene: KnownScene) -> tuple[set[Change], set[Change]]:
     return true, open_
 
 
+def without_loose(scene: KnownScene, tracks: Sequence[Track]) -> list[Track]:
+    """The tracks but those that hold nothing else than what is `loose`."""
+    if not scene.loose:
+        return list(tracks)
+    return [t for t in tracks if not all(i in scene.loose[k] for k, i in t.instance.items())]
+
+
 def sides(k: int) -> tuple[tuple[str, int, int], tuple[str, int, int]]:
     """Of scan `k` and the one before: what a change is called, the scan that has the object, the one that lacks it."""
     return ("added", k, k - 1), ("removed", k - 1, k)

@@ -119,10 +119,10 @@ def reason_of(error: OSError) -> str:
 
 def _say_done(session: Session, scene: LivingScene) -> None:
     """By how much the last scan was leveled, if it was, how it lies, and which masks were mended."""
-    from more2_jax.report import frame_text, leveled_text, repair_text
+    from more2_jax.report import frame_text, leveled_text, noise_text, repair_text
 
     last = scene.scans[-1]
-    for told in (leveled_text, frame_text):
+    for told in (leveled_text, frame_text, noise_text):
         if text := told(scene, last):
             session.say(text)
     for repair in last.repairs:

@@ -20,7 +20,7 @@ from more2_jax.report.lists import (
     timing_table,
 )
 from more2_jax.report.payload import payload
-from more2_jax.report.wording import frame_text, leveled_text
+from more2_jax.report.wording import frame_text, leveled_text, noise_text
 from more2_jax.types import LivingScene
 from more2_jax.whole_file import whole_file
 
@@ -103,7 +103,7 @@ def _summary(scene: LivingScene, names: str) -> str:
         + "".join(
             f" {text}."
             for s in scene.scans
-            for told in (leveled_text, frame_text)
+            for told in (leveled_text, frame_text, noise_text)
             if (text := told(scene, s))
         )
     )

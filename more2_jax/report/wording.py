@@ -18,6 +18,7 @@ from more2_jax.types import Changes, LivingScene, Observation, Repair, ScanRecor
 LOW_SCORE = 0.5  # a match below it is told as unsure; same objects usually score 0.5 to 0.9
 UNLIKELY = 0.6  # as is a change that is less probable than this
 LEAST_TURN_DEG = 2.0  # of a scan's frame against the first one's that is worth telling
+MUCH_NOISE_M = 0.02  # between two scans; depth cameras have 0.01
 
 Status = Literal["moved", "static", "added", "removed", "not_seen", "discovered", "present", "absent"]
 STATES: tuple[Status, ...] = ("moved", "added", "removed", "static", "not_seen", "discovered")
@@ -118,6 +119,14 @@ def frame_text(scene: LivingScene, scan: ScanRecord) -> str | None:
     if turn_deg < LEAST_TURN_DEG:
         return None
     return f"{scan.name}: lies in a frame of its own, turned by {turn_deg:.0f}° against {first.name}"
+
+
+def noise_text(scene: LivingScene, scan: ScanRecord) -> str | None:
+    """`friday: surfaces lie up to 2.4 cm off those before: small motions cannot be told`; None at the usual noise."""
+    if scan.frame.noise_m < MUCH_NOISE_M:
+        return None
+    off = f"surfaces lie up to {100 * scan.frame.noise_m:.1f} cm off those before, by noise and drift"
+    return f"{scan.name}: {off}: small motions cannot be told"
 
 
 def repair_text(scan: ScanRecord, repair: Repair) -> str:

@@ -1,5 +1,6 @@
 """Rooms without masks: scans are cut anew, and every object knows which instance shows it."""
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ from dataset_writers.ply_file import vertex_columns, write_ply
 from eval.data.cut_scans import CUTS, Cut, with_cuts
 from eval.data.masks import LOST
 from eval.data.truth import KnownObject, KnownScene
+from eval.scores.tracks import Track, without_loose
 from more2_jax.types import Instance, Scan
 from train.furniture.symmetry import SymmetryGroup
 
@@ -21,8 +23,11 @@ def box(center, side: float, rng: np.random.Generator) -> np.ndarray:
     return p * side + center
 
 
-def room(folder: Path) -> KnownScene:
-    """Two scans of a floor, a wall, two boxes far apart, one of which moves, and one within the floor's thickness."""
+def room(folder: Path, loose: bool = False) -> KnownScene:
+    """Two scans of a floor, a wall, two boxes far apart, one of which moves, and one within the floor's thickness.
+
+    `loose`: and a box without an owner, elsewhere in each, and one that is on the wall in both.
+    """
     scans, true = [], []
     for k in range(SCANS):
         rng = np.random.default_rng(k)
@@ -30,6 +35,9 @@ def room(folder: Path) -> KnownScene:
         wall = rng.uniform([0, 0, 0], [0, 4, 2], (20_000, 3))
         flat = rng.uniform([0.5, 3, 0.01], [0.9, 3.4, 0.02], (800, 3))
         own = [box([1, 1 + 0.8 * k, 0.36], 0.7, rng), box([2.8, 2.8, 0.31], 0.6, rng), flat]
+        if loose:
+            floor = np.concatenate([floor, box([3.2 - k, 0.8, 0.21], 0.4, rng)])
+            wall = np.concatenate([wall, box([0.05, 2.8, 1.2], 0.5, rng) * [0.2, 1, 1]])
         points = np.concatenate([floor, wall, *own]).astype(np.float32).astype(np.float64)
         masks = np.repeat([0, 0, 7, 8, 9], [len(floor), len(wall), *map(len, own)]).astype(np.int32)
         path = write_ply(folder / f"scan_{k}.ply", vertex_columns(points, instance=masks))
@@ -63,6 +71,29 @@ def test_every_object_takes_the_instance_that_shows_it(tmp_path: Path, cut: Cut)
         assert len(found.scans[k].instances) == 2
         points = sum(len(i.points) for i in found.scans[k].instances) + len(found.scans[k].background)
         assert points == 30_000 + 20_000 + 2 * 6000 + 800
+
+
+@pytest.mark.parametrize("cut", CUTS)
+def test_what_is_loose_counts_neither_way_and_what_is_on_a_wall_counts(tmp_path: Path, cut: Cut):
+    T = np.eye(4)
+    T[:2, 3] = 2.0
+    scene = dataclasses.replace(room(tmp_path, loose=True), T_scan_room=(T, T), room_m=(4.0, 4.0))
+    found = with_cuts(scene, cut)
+    box_of = [[i.id for i in s.instances if 0.1 < i.points[:, 2].mean() < 0.3] for s in found.scans]
+    assert [set(ids) for ids in found.loose] == [set(ids) for ids in box_of] and all(map(len, box_of))
+    tracks = [
+        Track(instance={k: i.id}, T_track_scan={k: np.eye(4)}, points=i.points)
+        for k in range(SCANS)
+        for i in found.scans[k].instances
+    ]
+    both = Track(
+        instance={0: box_of[0][0], 1: found.objects[0].instance[1]},
+        T_track_scan=dict.fromkeys(range(SCANS), np.eye(4)),
+        points=tracks[0].points,
+    )
+    left = without_loose(found, [*tracks, both])
+    assert len(left) == len(tracks) + 1 - sum(map(len, box_of)) and left[-1] is both
+    assert without_loose(scene, tracks) == tracks
 
 
 def test_rooms_without_owners_of_vertices_are_refused(tmp_path: Path):

@@ -14,7 +14,16 @@ from skimage.color import rgb2lab
 
 from more2_jax.config import SceneConfig
 from more2_jax.geometry.poses import apply_pose
-from more2_jax.report import color, frame_text, leveled_text, motion_text, report_html, rgb, write_report
+from more2_jax.report import (
+    color,
+    frame_text,
+    leveled_text,
+    motion_text,
+    noise_text,
+    report_html,
+    rgb,
+    write_report,
+)
 from more2_jax.report.blob import Blob
 from more2_jax.report.coverage import coverage
 from more2_jax.report.palette import BASE, ink
@@ -143,6 +152,20 @@ def test_how_a_scan_lies_in_a_frame_of_its_own_is_told_and_where_nothing_tells()
     assert text is not None and "nothing tells how" in text and text in report_html(lost, CONFIG)
     both = in_frames(Frame(T_scene_scan=turned), Frame(T_scene_scan=turned))
     assert frame_text(dataclasses.replace(both, scans=both.scans[1:]), both.scans[-1]) is None  # one frame
+
+
+def test_much_noise_between_scans_is_told():
+    told = []
+    for noise_m in (0.0, 0.012, 0.024):
+        friday = dataclasses.replace(SCENE.scans[2], frame=Frame(noise_m=noise_m))
+        scene = dataclasses.replace(SCENE, scans=(*SCENE.scans[:2], friday))
+        told.append([noise_text(scene, s) for s in scene.scans])
+    text = (
+        "friday: surfaces lie up to 2.4 cm off those before, by noise and drift: small motions cannot be told"
+    )
+    assert told == [[None] * 3, [None] * 3, [None, None, text]]
+    assert text + "." in report_html(scene, CONFIG)
+    assert "by noise and drift" not in report_html(SCENE, CONFIG)
 
 
 def test_the_tilt_of_a_leveled_scan_is_told():

@@ -170,6 +170,7 @@ def read_scene(folder: str | Path) -> FlyingScene:
             name=truth["name"],
             regime=truth["regime"],
             T_scan_room=tuple(np.array(s["T_scan_room"]) for s in truth["scans"] if "T_scan_room" in s),
+            room_m=tuple(truth["room_m"]) if truth["regime"] == "real" else None,
             looked_at=tuple(s["looked_at"] for s in truth["scans"] if "looked_at" in s),
             looked_at_next=tuple(s["looked_at_next"] for s in truth["scans"] if "looked_at_next" in s),
         )

@@ -97,6 +97,7 @@ class FlyingScene:
     # Regime `real`, a scan: how much of an object's last place it saw, and of the place of what came by the next scan.
     looked_at: tuple[dict[str, float], ...] = ()
     looked_at_next: tuple[dict[str, float], ...] = ()
+    room_m: tuple[float, float] | None = None  # regime `real`: the floor, x by y, about the room's zero
 
 
 def flying_scene(
