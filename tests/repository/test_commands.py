@@ -267,7 +267,8 @@ def test_a_table_of_scenes_is_built(follow, quickly, tmp_path, monkeypatch, caps
     """By both commands of the guide, here by this process in place of workers and actors."""
     asked: list[tuple[int | None, str | None]] = []
 
-    def team(workers: int | None, ray: str | None, tasks: int) -> Inline:
+    def team(workers: int | None, ray: str | None, tasks: int, limit_s: float | None) -> Inline:
+        assert limit_s is None
         asked.append((workers, ray))
         return Inline()
 

@@ -176,8 +176,12 @@ def test_three_scans_tell_more_than_two():
         assert not found.changed[best(found.instance, truth == 2)[0] - 1]
     for found, (_, truth) in zip(segment_changes([s for s, _ in scans])[:2], scans[:2], strict=True):
         assert found.changed[best(found.instance, truth == 2)[0] - 1]
+
+
+def test_what_one_of_several_scans_shows_empty_counts_before_what_another_shows():
     said = [np.array(s, np.int8) for s in ([STAYED, STAYED, UNKNOWN], [EMPTIED, UNKNOWN, UNKNOWN])]
-    assert together(said).tolist() == [EMPTIED, STAYED, UNKNOWN]
+    assert together(said, 3).tolist() == together(said[::-1], 3).tolist() == [EMPTIED, STAYED, UNKNOWN]
+    assert together([], 2).tolist() == [UNKNOWN, UNKNOWN]
 
 
 def test_normals_and_sensors_may_be_given():
