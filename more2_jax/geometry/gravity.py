@@ -33,6 +33,7 @@ LEAST_AT_END = 0.6
 LEAST_GAIN = 1.1  # levels hold so many times what they hold along z, or up is z
 # Share of a scan below its floor, or above its ceiling: noise, a stair seen through a door.
 MOST_BEYOND = 0.05
+BEYOND_M = 0.15  # so far below it: drift bends floors by a few centimeters; legs of tables are longer
 REACH_M = 50.0  # along an axis: a stray point a kilometer off must not make a million layers
 TRIED_POINTS = 5000  # at even steps, along the directions tried
 MOST_POINTS = 20_000  # at even steps, for the rest
@@ -108,7 +109,7 @@ def stand_on_floor(points: Points, up: Direction) -> bool:
 
 def beyond(along: Float[np.ndarray, " n"], height: float) -> float:
     """Share of the points below a level."""
-    return float(np.mean(along < height - 2 * BAND_M))
+    return float(np.mean(along < height - BEYOND_M))
 
 
 def least_turn(up: Direction) -> Float[np.ndarray, "3 3"]:

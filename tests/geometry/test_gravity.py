@@ -230,3 +230,20 @@ def test_what_lies_below_the_floor_must_be_little():
     )
     assert stand_on_floor(np.concatenate([points, below[::4]]), UP)
     assert not stand_on_floor(np.concatenate([points, below]), UP)
+
+
+@pytest.mark.parametrize("bent_m", [0.0, 0.08, 0.12])
+def test_a_floor_that_drift_bends_is_one_and_a_low_table_is_none(bent_m):
+    rng = np.random.default_rng(0)
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_rotvec([np.deg2rad(3.0), 0, 0]).as_matrix()
+    bent = floor(rng, 6000) + [0.0, 0.0, 0.012] * rng.normal(size=(6000, 3))
+    corner = (bent[:, 0] > np.quantile(bent[:, 0], 0.7)) & (bent[:, 1] > np.quantile(bent[:, 1], 0.6))
+    bent[corner, 2] -= bent_m
+    scan = apply_pose(T, np.concatenate([bent, walls(rng, 3000)]))
+    found = gravity(scan)
+    assert found is not None and found.tilt_deg == pytest.approx(3.0, abs=1.0)
+    assert stand_on_floor(scan, found.up)
+    top, legs = box(rng, 3000, (1, 1, 0.3), (4, 3, 0.3)), box(rng, 1500, (1, 1, 0), (4, 3, 0.28))
+    lamps = box(rng, 1500, (1, 1, 0.4), (4, 3, 1.2))
+    assert gravity(apply_pose(T, np.concatenate([top, legs, lamps]))) is None
