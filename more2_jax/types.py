@@ -285,16 +285,14 @@ class Frame:
     T_scene_scan: Float[np.ndarray, "4 4"] = field(default_factory=lambda: np.eye(4))  # float64, row-major
     sigma_m: float = 0.0  # standard errors of what it makes of a place and of a direction; 0 where it was
     sigma_deg: float = 0.0  # taken as given
-    # How far its surfaces lie off those of the scene that it shows again: noise, and drift; 0 where it is not known.
-    noise_m: float = 0.0
-    # Does not fit those before as given, and nothing tells how it lies: what moved, and how far, is in doubt.
-    unknown: bool = False
+    noise_m: float = 0.0  # how far its surfaces lie off the scene's, noise and drift; 0 where it is not known
+    unknown: bool = False  # nothing tells how it lies: what moved, and how far, is in doubt
 
     @property
     def tilt_deg(self) -> float:
         """Angle between the scan's z and the scene's: upright, that by which the scan was leveled."""
-        z = self.T_scene_scan[:3, 2]
-        return float(np.rad2deg(np.arctan2(np.hypot(z[0], z[1]), z[2])))
+        x, y, z = self.T_scene_scan[:3, 2]
+        return float(np.rad2deg(np.arctan2(np.hypot(x, y), z)))
 
 
 @dataclass(frozen=True, kw_only=True)
