@@ -118,7 +118,7 @@ def reason_of(error: OSError) -> str:
 
 
 def _say_done(session: Session, scene: LivingScene) -> None:
-    """By how much the last scan was leveled, if it was, how it lies, and which masks were mended."""
+    """By how much the last scan was leveled, if it was, how it lies, how noisy it is, and which masks were mended."""
     from more2_jax.report import frame_text, leveled_text, noise_text, repair_text
 
     last = scene.scans[-1]

@@ -108,7 +108,7 @@ def stand_on_floor(points: Points, up: Direction) -> bool:
 
 
 def beyond(along: Float[np.ndarray, " n"], height: float) -> float:
-    """Share of the points below a level."""
+    """Share of the points well below a level."""
     return float(np.mean(along < height - BEYOND_M))
 
 

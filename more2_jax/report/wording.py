@@ -122,10 +122,10 @@ def frame_text(scene: LivingScene, scan: ScanRecord) -> str | None:
 
 
 def noise_text(scene: LivingScene, scan: ScanRecord) -> str | None:
-    """`friday: surfaces lie up to 2.4 cm off those before: small motions cannot be told`; None at the usual noise."""
+    """`friday: surfaces lie some 2.4 cm off those before, by noise and drift: …`; None at the usual noise."""
     if scan.frame.noise_m < MUCH_NOISE_M:
         return None
-    off = f"surfaces lie up to {100 * scan.frame.noise_m:.1f} cm off those before, by noise and drift"
+    off = f"surfaces lie some {100 * scan.frame.noise_m:.1f} cm off those before, by noise and drift"
     return f"{scan.name}: {off}: small motions cannot be told"
 
 

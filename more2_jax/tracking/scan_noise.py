@@ -17,7 +17,7 @@ REACH_M = 0.15  # what is farther from a surface is none of it
 SHARE = 0.68  # of the points of one scan about the other's surfaces: one standard deviation
 LEAST_POINTS = 200  # of these that tell
 MOST_POINTS = 4000  # of a scan, at even steps
-# So near, at least, lies what fusion and drift leave of one surface: rooms of regime `real` have 0.8 to 1.2 cm of
+# So near, at least, lies what fusion and drift leave of one surface: rooms of regime `real` have 0.9 to 1.2 cm of
 # noise; and so many times the noise where there is more, up to the last: docs/developing/notebook/scan_noise.md.
 NEAR_M, NOISES, FARTHEST_M = 0.03, 2.5, 0.08
 

@@ -99,22 +99,20 @@ def test_no_pose_is_asked_of_what_changed_its_shape(folder):
         assert record.get("mr.strict", 1.0) == 1
 
 
-@pytest.mark.parametrize(("regime", "reshaped"), [("real", 1.5), ("real", -0.1), ("sparse", 0.4)])
-def test_other_shares_and_regimes_are_refused(tmp_path, regime, reshaped):
+@pytest.mark.parametrize(
+    ("option", "needed", "values"),
+    [
+        ("reshaped", "a share from 0 to 1", [("real", 1.5), ("real", -0.1), ("sparse", 0.4)]),
+        ("noise", "a factor from 0", [("real", -1.0), ("real", np.inf), ("sparse", 2.0)]),
+    ],
+)
+def test_other_values_and_regimes_are_refused(tmp_path, option, needed, values):
     source = tmp_path / "models.npz"
     write_packed(source, MODELS)
-    settings = synthesize.Settings(source=source, regime=regime, out=tmp_path / "out", reshaped=reshaped)
-    with pytest.raises(ValueError, match=f"reshaped {reshaped}, regime {regime}; needed a share from 0 to 1"):
-        synthesize.main(settings)
-
-
-@pytest.mark.parametrize(("regime", "noise"), [("real", -1.0), ("real", np.inf), ("sparse", 2.0)])
-def test_noise_that_is_no_factor_and_of_other_regimes_is_refused(tmp_path, regime, noise):
-    source = tmp_path / "models.npz"
-    write_packed(source, MODELS)
-    settings = synthesize.Settings(source=source, regime=regime, out=tmp_path / "out", noise=noise)
-    with pytest.raises(ValueError, match=f"noise {noise}, regime {regime}; needed a factor from 0"):
-        synthesize.main(settings)
+    for regime, value in values:
+        settings = synthesize.Settings(source=source, regime=regime, out=tmp_path / "out", **{option: value})
+        with pytest.raises(ValueError, match=f"{option} {value}, regime {regime}; needed {needed}"):
+            synthesize.main(settings)
 
 
 def test_without_the_option_nothing_is_drawn(monkeypatch):
