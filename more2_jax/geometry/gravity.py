@@ -26,7 +26,7 @@ LEAST_WIDTH_M = (
     0.15  # standard deviation of the levels' points, the narrower way: of a strip half a meter wide
 )
 # Of the points about a floor or a ceiling so many lie within `SCALE_M`: clutter lies at any height.
-LEAST_THIN = 0.5
+LEAST_THIN = 0.45
 # Floors and ceilings are at the ends of a room; tops of furniture, whose edges masks leave, have legs below and lamps
 # above them. Levels at an end hold so much of the fullest.
 LEAST_AT_END = 0.6

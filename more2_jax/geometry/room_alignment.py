@@ -126,7 +126,7 @@ def closeness(a: RoomShape, b: RoomShape, T_a_b: Pose) -> float:
 
 
 def fit_from_any_yaw(a: RoomShape, b: RoomShape) -> RoomFit | None:
-    """`T_a_b` of scans whose z is up to about 10°, and whose floors are seen, wherever they lie.
+    """`T_a_b` of scans whose z is up to about 10° where floors are seen, else to a few degrees, wherever they lie.
 
     None where no pose fits, or two fit that differ.
     """
@@ -203,10 +203,7 @@ def _apart_m(f: RoomFit, g: RoomFit, points: Points) -> float:
 
 def _begun(a: RoomShape, b: RoomShape) -> Iterator[Pose]:
     """Poses to begin from: leveled, walls parallel, and where most of what stands lies over what stands."""
-    up = [gravity(s.points) for s in (a, b)]
-    if None in up:
-        return
-    levels = [u.level(np.zeros(3)) for u in up if u is not None]
+    levels = [_level(s) for s in (a, b)]
     first, second = (apply_pose(T, s.points) for T, s in zip(levels, (a, b), strict=True))
     lift = np.eye(4)
     lift[2, 3] = (floor_height(first) or 0.0) - (floor_height(second) or 0.0)
@@ -216,6 +213,12 @@ def _begun(a: RoomShape, b: RoomShape) -> Iterator[Pose]:
         for shift in _shifts(first, apply_pose(T, second)):
             T[:2, 3] = shift
             yield np.linalg.inv(levels[0]) @ T @ levels[1]
+
+
+def _level(s: RoomShape) -> Pose:
+    """The pose that levels a scan by its floor; where none is seen, z is taken as up."""
+    up = gravity(s.points)
+    return np.eye(4) if up is None else up.level(np.zeros(3))
 
 
 def _yaws(a: Points, b: Points) -> Float[np.ndarray, " k"]:

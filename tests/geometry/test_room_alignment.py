@@ -5,6 +5,7 @@ import pytest
 from factories import turn_z
 from furnished_room import empty_room, furnished_room
 
+from more2_jax.geometry.gravity import gravity
 from more2_jax.geometry.poses import apply_pose
 from more2_jax.geometry.room_alignment import fit_as_given, fit_from_any_yaw, fits_from_any_yaw, room_shape
 
@@ -50,3 +51,13 @@ def test_scans_in_one_frame_fit_as_they_are_given(given):
     a, b = shapes(furnished_room(SIDES_M, 0), furnished_room(SIDES_M, 1), given)
     fit = fit_as_given(a, b)
     assert fit is not None and off_m(fit.T_a_b, np.linalg.inv(given), b.points) < 0.02
+
+
+def test_a_room_whose_floor_is_too_bent_to_level_it_is_laid_on_by_all_else():
+    first = furnished_room(SIDES_M, 0)
+    low = first[:, 2] < 0.1
+    first[low, 2] += 0.1 * np.sin(2.0 * first[low, 0]) * np.cos(3.0 * first[low, 1])
+    a, b = shapes(first, furnished_room(SIDES_M, 1), AWAY)
+    assert gravity(a.points) is None
+    fit = fit_from_any_yaw(a, b)
+    assert fit is not None and off_m(fit.T_a_b, np.linalg.inv(AWAY), b.points) < 0.1
