@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from functools import partial
-from itertools import repeat
 from typing import Any
 
 import numpy as np
@@ -34,11 +33,10 @@ from more2_jax.tracking.changes import (
 )
 from more2_jax.tracking.comparison import Comparison
 from more2_jax.tracking.identify import Found, Identified, chances, identify, with_left_over
-from more2_jax.tracking.joined_masks import join_parts
 from more2_jax.tracking.leveling import as_given, level_by_objects, level_of, leveled, shows_floor, tells_up
 from more2_jax.tracking.looked_at import not_looked_at, not_looked_at_before, with_not_seen
 from more2_jax.tracking.mask_borders import mend_borders
-from more2_jax.tracking.merged_masks import divide_merged
+from more2_jax.tracking.mask_mends import Mend, mends_of_masks
 from more2_jax.tracking.object_views import Views
 from more2_jax.tracking.objects import SCENE_FRAME, accumulated, new_objects, next_number
 from more2_jax.tracking.regrouped import Regrouped, as_sure_as_masks
@@ -48,8 +46,7 @@ from more2_jax.tracking.rooms import rooms_of
 from more2_jax.tracking.scan_record import record
 from more2_jax.tracking.split_masks import mend_splits
 from more2_jax.tracking.surroundings import surroundings, surroundings_of_objects
-from more2_jax.tracking.unmasked import add_unmasked, not_sought, without_unfound
-from more2_jax.tracking.unseen_wholes import join_smooth
+from more2_jax.tracking.unmasked import not_sought, without_unfound
 from more2_jax.types import (
     Embedding,
     Instance,
@@ -65,7 +62,6 @@ from more2_jax.types import (
 
 # Regrouped masks, objects and instances as matching compared them, and the matches.
 Compared = tuple[Regrouped, list[tuple[ObservedObject, Pose]], list[ObservedObject], Identified]
-Mend = Callable[[Regrouped, Comparison], Regrouped | None]
 
 CLOSED_AT_ONCE = 64  # objects whose poses are refined in one call; each takes a MB
 
@@ -136,20 +132,6 @@ def who_is_who(
         masks, old, new, found = known
         found = as_sure_as_masks(with_left_over(found, config, rooms), masks, config)
         return masks, old, new, found.without_seen()
-
-
-def mends_of_masks(scene: LivingScene, scan: Scan) -> Iterator[Mend]:
-    """Yields what mends masks, in turn; the last until nothing is left to do."""
-
-    def divided(masks: Regrouped, compared: Comparison) -> Regrouped | None:
-        return divide_merged(masks, compared, next_number(masks.objects, scene.scans))
-
-    yield join_parts
-    yield divided
-    yield lambda masks, compared: divided(masks, compared) if masks.divided else None
-    yield partial(join_smooth, scans=scene.scans, scan=scan)
-    yield partial(add_unmasked, scans=scene.scans, scan=scan)
-    yield from repeat(without_unfound)
 
 
 def add_scan(

@@ -9,8 +9,8 @@ import pytest
 from furnished import sheet
 from small_scenes import CONFIG, piece, scan
 
-import more2_jax.scene
 from more2_jax.scene import add_scan, start_scene
+from more2_jax.tracking import mask_mends
 from more2_jax.tracking.objects import next_number, points_of
 from more2_jax.types import Scan
 
@@ -84,13 +84,13 @@ def test_masks_are_looked_at_again_where_one_was_divided(tiny_prior, monkeypatch
     """Its halves may show that a mask of the other scan holds two things as well."""
     found = []
 
-    def noted(masks, compared, first_number, divide=more2_jax.scene.divide_merged):
+    def noted(masks, compared, first_number, divide=mask_mends.divide_merged):
         divided = divide(masks, compared, first_number)
         found.append(divided is not None)
         assert first_number == next_number(masks.objects, ())
         return divided
 
-    monkeypatch.setattr(more2_jax.scene, "divide_merged", noted)
+    monkeypatch.setattr(mask_mends, "divide_merged", noted)
     visits = [scan(n, {0: (0.0, 0.0), 1: (0.3, 3.0), 2: (0.1, -3.0)}) for n in "ab"]
     first = in_one(visits[0]) if merged else visits[0]
     add_scan(tiny_prior, start_scene(tiny_prior, first, CONFIG), visits[1], CONFIG)

@@ -104,15 +104,7 @@ class InstanceParts(Parts):
 
     def odds_together(self, row: int, part: int) -> float:
         """Log odds of two instances together with the object that the first was found to be."""
-        both = joined(self.instances[row], [self.instances[part]])
-        (code,) = embed(self.compared.prior, [both.points], [both.normals])
-        new = dataclasses.replace(
-            self.compared.new[row],
-            points=both.points,
-            normals=both.normals,
-            color=color_of(both.colors),
-            embedding=code,
-        )
+        new = instances_together(self.compared, self.instances, row, part)
         return self.compared.odds_of_pair(self.compared.old[self.partner[row]], new)
 
 
@@ -128,19 +120,46 @@ class ObjectParts(Parts):
 
     def may_be_one(self, row: int, part: int) -> bool:
         """Whether the second was seen once, by the scan that saw the first last: two parts of one mask."""
-        last = self.objects[row].observations[-1].scan
-        return row != part and [s.scan for s in self.objects[part].observations] == [last]
+        return row != part and seen_with(self.objects[row], self.objects[part])
 
     def odds_together(self, row: int, part: int) -> float:
         """Log odds of two objects together with the instance that the first was found to be."""
-        both = absorbed(self.objects[row], self.objects[part])
-        (code,) = embed(self.compared.prior, [both.points], [both.normals])
-        cloud = ObservedObject(points=both.points, normals=both.normals, color=both.color, embedding=code)
-        old = transform(cloud, place_of(both.observations[-1]))
-        old = dataclasses.replace(
-            old, sight=self.compared.old[row].sight, around=self.compared.old[row].around
-        )
+        old = objects_together(self.compared, self.objects, row, part)
         return self.compared.odds_of_pair(old, self.compared.new[self.partner[row]])
+
+
+def seen_with(o: SceneObject, part: SceneObject) -> bool:
+    """Whether an object was seen once, by the scan that saw the other last: both may be parts of one mask."""
+    return [s.scan for s in part.observations] == [o.observations[-1].scan]
+
+
+def instances_together(
+    compared: Comparison, instances: Sequence[Instance], row: int, part: int
+) -> ObservedObject:
+    """Two instances of a scan as one, as it would be compared."""
+    both = joined(instances[row], [instances[part]])
+    (code,) = embed(compared.prior, [both.points], [both.normals])
+    return dataclasses.replace(
+        compared.new[row],
+        points=both.points,
+        normals=both.normals,
+        color=color_of(both.colors),
+        embedding=code,
+    )
+
+
+def objects_together(
+    compared: Comparison, objects: Sequence[SceneObject], row: int, part: int
+) -> ObservedObject:
+    """An object and its part (`seen_with`) as one, as it would be compared."""
+    both = absorbed(objects[row], objects[part])
+    (code,) = embed(compared.prior, [both.points], [both.normals])
+    cloud = ObservedObject(points=both.points, normals=both.normals, color=both.color, embedding=code)
+    return dataclasses.replace(
+        transform(cloud, place_of(both.observations[-1])),
+        sight=compared.old[row].sight,
+        around=compared.old[row].around,
+    )
 
 
 def join_parts(whole: Regrouped, compared: Comparison) -> Regrouped | None:

@@ -17,6 +17,7 @@ from eval.peers.learned.vn_dgcnn import VNDGCNN
 from eval.peers.learned.vn_onet import VNONet
 from more2_jax.config import EncoderConfig
 
+assigned = jax.jit(sinkhorn, static_argnums=3)
 SMALL = EncoderConfig(widths=(4, 4, 8), linear_blocks=3, neighbors=4, code=6, points=32)
 RNG = np.random.default_rng(0)
 CLOUD = RNG.normal(size=(32, 3)).astype(np.float32)
@@ -111,7 +112,7 @@ def test_the_order_of_points_changes_no_code(dgcnn):
 
 
 def test_a_centered_cloud_has_mean_zero_and_radius_one():
-    cloud = centered(jnp.asarray(7 * CLOUD + 3), jnp.asarray(REAL))
+    cloud = jax.jit(centered)(jnp.asarray(7 * CLOUD + 3), jnp.asarray(REAL))
     real = np.asarray(cloud.points)[REAL]
     np.testing.assert_allclose(real.mean(axis=0), 0, atol=1e-5)
     assert np.mean(np.sum(real**2, axis=1)) == pytest.approx(1, abs=1e-5)
@@ -123,17 +124,17 @@ def test_a_plane_that_is_linear_is_looked_up_exactly():
     middle = (np.arange(conv_onet.CELLS) + 0.5) / conv_onet.CELLS * 2 - 1
     plane = jnp.asarray(2 * middle[:, None, None] - 3 * middle[None, :, None] + 1)
     at = RNG.uniform(-0.9, 0.9, (20, 3))
-    found = conv_onet.looked_up(plane, jnp.asarray(at), (0, 2))[:, 0]
+    found = jax.jit(conv_onet.looked_up, static_argnums=2)(plane, jnp.asarray(at), (0, 2))[:, 0]
     np.testing.assert_allclose(found, 2 * at[:, 0] - 3 * at[:, 2] + 1, atol=1e-5)
 
 
 def test_cells_hold_the_mean_of_their_points():
     points = jnp.array([[-0.99, -0.99, 0], [-0.98, -0.99, 0], [0.99, 0.99, 0], [5.0, 5.0, 0]])
-    cell = conv_onet.cell_of(points, (0, 1))
+    cell = jax.jit(conv_onet.cell_of, static_argnums=1)(points, (0, 1))
     last = conv_onet.CELLS**2 - 1
     assert cell.tolist() == [0, 0, last, last]
     mask = jnp.array([True, True, True, False])
-    means = conv_onet.cell_means(jnp.array([[1.0], [3.0], [5.0], [70.0]]), cell, mask)
+    means = jax.jit(conv_onet.cell_means)(jnp.array([[1.0], [3.0], [5.0], [70.0]]), cell, mask)
     assert float(means[0, 0]) == 2 and float(means[last, 0]) == 5 and float(means.sum()) == 7
 
 
@@ -141,11 +142,11 @@ def test_cells_hold_the_mean_of_their_points():
 def test_columns_of_an_assignment_sum_to_one_and_rows_in_the_end(seed):
     rng = np.random.default_rng(seed)
     rows, columns = np.arange(7) < 5, np.arange(6) < 4
-    found = np.exp(sinkhorn(jnp.asarray(rng.normal(size=(7, 6))), rows, columns, 200))
+    found = np.exp(assigned(jnp.asarray(rng.normal(size=(7, 6))), rows, columns, 200))
     np.testing.assert_allclose(found[:, :-1][:, columns].sum(axis=0), 1, atol=1e-5)
     np.testing.assert_allclose(found[:-1][rows].sum(axis=1), 1, atol=1e-5)
     assert found[:-1][~rows].max() == found[:, :-1][:, ~columns].max() == found[-1, -1] == 0
-    early = np.exp(sinkhorn(jnp.asarray(rng.normal(size=(7, 6))), rows, columns, 1))
+    early = np.exp(assigned(jnp.asarray(rng.normal(size=(7, 6))), rows, columns, 1))
     np.testing.assert_allclose(early[:, :-1][:, columns].sum(axis=0), 1, atol=1e-5)
 
 
@@ -153,7 +154,7 @@ def test_an_assignment_finds_a_permutation_and_leaves_out_who_has_no_partner():
     order = np.random.default_rng(0).permutation(6)
     scores = np.full((7, 6), -30.0)
     scores[np.arange(6), order] = 30.0  # row 6 is like none
-    found = np.exp(sinkhorn(jnp.asarray(scores), jnp.ones(7, bool), jnp.ones(6, bool), 20))
+    found = np.exp(assigned(jnp.asarray(scores), jnp.ones(7, bool), jnp.ones(6, bool), 20))
     assert found[:6, :6].argmax(axis=1).tolist() == order.tolist()
     assert found[6, -1] == pytest.approx(1, abs=1e-4) and NONE < -1e8
 
@@ -161,14 +162,15 @@ def test_an_assignment_finds_a_permutation_and_leaves_out_who_has_no_partner():
 def test_pair_features_do_not_turn():
     R = Rotation.random(rng=np.random.default_rng(5)).as_matrix().astype(np.float32)
     whole = jnp.ones(32, bool)
-    here, there = (pair_features(oriented(jnp.asarray(c), whole)) for c in (CLOUD, CLOUD @ R.T))
+    features = jax.jit(lambda points, mask: pair_features(oriented(points, mask)))
+    here, there = (features(jnp.asarray(c), whole) for c in (CLOUD, CLOUD @ R.T))
     np.testing.assert_allclose(there, here, atol=2e-3)
     assert np.ptp(np.asarray(here), axis=(0, 1)).min() > 0.5
 
 
 def test_normals_of_a_plane_stand_on_it_and_face_outward():
     flat = RNG.uniform(-1, 1, (64, 3)) * [1, 1, 0] + [0, 0, 0.4]
-    cloud = oriented(jnp.asarray(flat, jnp.float32), jnp.ones(64, bool))
+    cloud = jax.jit(oriented)(jnp.asarray(flat, jnp.float32), jnp.ones(64, bool))
     np.testing.assert_allclose(cloud.normals, np.tile([0, 0, 1], (64, 1)), atol=1e-3)
 
 
@@ -179,13 +181,14 @@ def test_the_pose_of_points_that_belong_together(upright):
         if upright
         else jaxlie.SO3.sample_uniform(jax.random.key(4)).as_matrix()
     )
-    T = weighted_pose.pose(
+    pose = jax.jit(weighted_pose.pose, static_argnums=3)
+    T = pose(
         jnp.asarray(CLOUD), CLOUD @ R.T + jnp.array([1.0, -2, 3]), jnp.asarray(REAL, jnp.float32), upright
     )
     np.testing.assert_allclose(T[:3, :3], R, atol=1e-4)
     np.testing.assert_allclose(T[:3, 3], [1, -2, 3], atol=1e-4)
     if upright:
-        tilted = weighted_pose.pose(jnp.asarray(CLOUD), jnp.asarray(moved(CLOUD)), jnp.ones(32), True)
+        tilted = pose(jnp.asarray(CLOUD), jnp.asarray(moved(CLOUD)), jnp.ones(32), True)
         np.testing.assert_allclose(tilted[2, :3], [0, 0, 1], atol=1e-6)
 
 

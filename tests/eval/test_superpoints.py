@@ -9,12 +9,16 @@ import pytest
 from known_scenes import pose
 
 from eval.peers.learned import geotransformer as geo
+from eval.peers.learned import local_to_global as fine
+from eval.peers.learned import patches
 from eval.peers.learned.clouds import thinned
 from eval.peers.learned.geometric_attention import WIDTH, Attention, Geometry
-from eval.peers.learned.local_to_global import local_to_global, mutual
-from eval.peers.learned.patches import MEMBERS, SUPERPOINTS, overlap, patches_of
+from eval.peers.learned.patches import MEMBERS, SUPERPOINTS
 from eval.peers.learned.training_pairs import turned_pair
 
+local_to_global, mutual = jax.jit(fine.local_to_global, static_argnums=3), jax.jit(fine.mutual)
+patches_of, overlap = jax.jit(patches.patches_of), jax.jit(patches.overlap)
+true_partners = jax.jit(geo.true_partners)
 RNG = np.random.default_rng(0)
 CLOUD, REAL = (np.asarray(x[0]) for x in thinned([RNG.normal(size=(300, 3))], 64)[:2])
 REAL = REAL & (np.arange(64) < 50)
@@ -53,10 +57,10 @@ def test_attention_asks_only_what_is_real_and_sees_how_it_lies():
     x, points = (jnp.asarray(RNG.normal(size=(6, n)), jnp.float32) for n in (WIDTH, 3))
     real = jnp.arange(6) < 5
     lies = Geometry()
-    g = jnp.asarray(lies.apply(lies.init(jax.random.key(1), points, real), points, real))
+    g = jax.jit(lambda key: lies.init_with_output(key, points, real)[0])(jax.random.key(1))
     one = Attention()
-    params = one.init(jax.random.key(0), x, x, real, g)
-    asked = partial(one.apply, params)
+    params = jax.jit(one.init)(jax.random.key(0), x, x, real, g)
+    asked = jax.jit(partial(one.apply, params))
     np.testing.assert_allclose(
         asked(x, jnp.where(real[:, None], x, 9.0), real, g), asked(x, x, real, g), atol=1e-5
     )
@@ -113,10 +117,10 @@ def test_partners_must_be_among_the_best_of_both():
 def test_true_partners_and_who_has_none():
     one = patches_of(jnp.asarray(CLOUD), jnp.asarray(REAL))
     size = int((one.owner == 2)[REAL].sum())
-    own = geo.true_partners(jnp.asarray(np.diag(REAL)), one, one, jnp.array([2, 2]))
+    own = true_partners(jnp.asarray(np.diag(REAL)), one, one, jnp.array([2, 2]))
     wanted = np.diag((np.arange(MEMBERS + 1) < size).astype(np.float32))
     np.testing.assert_array_equal(own, wanted)
-    other = geo.true_partners(jnp.asarray(np.diag(REAL)), one, one, jnp.array([2, 3]))
+    other = true_partners(jnp.asarray(np.diag(REAL)), one, one, jnp.array([2, 3]))
     assert not other[:-1, :-1].any() and other[:-1, -1].sum() == size
     assert other[-1, :-1].sum() == (one.owner == 3)[REAL].sum()
 

@@ -39,6 +39,12 @@ from more2_jax.types import Instance, Scan
 
 EYE = np.array([0.0, -3.0, 0.5])
 ROBUST = preset("robust", upright=True)
+# Compiled: one by one, their operations would take longer.
+clear_at, costs_of, surface_of = (
+    jax.jit(clearance),
+    jax.jit(free_space_cost, static_argnums=(3, 4)),
+    jax.jit(whole_surface),
+)
 
 
 def grid(x, y, z):
@@ -62,7 +68,7 @@ def sight():
 
 def free_at(sight, points):
     device = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), sight)
-    return np.asarray(clearance(device, jnp.asarray(points, jnp.float32)))
+    return np.asarray(clear_at(device, jnp.asarray(points, jnp.float32)))
 
 
 def test_in_front_of_what_was_seen_space_is_free_by_the_way_that_is_left(sight):
@@ -147,9 +153,10 @@ def test_a_sensor_inside_what_it_saw_has_no_view():
 def test_what_is_looked_through_is_a_share_of_real_points(sight):
     device = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), sight)
     points = jnp.array([[0.0, -2.0, 0.5], [0.0, 0.0, 0.5], [0.0, -2.0, 0.5]], jnp.float32)
-    share = looked_through(device, points, jnp.array([True, True, False]), CLEARLY)
+    asked = jax.jit(looked_through, static_argnums=3)
+    share = asked(device, points, jnp.array([True, True, False]), CLEARLY)
     assert float(share) == pytest.approx(0.5)
-    assert float(looked_through(device, points, jnp.zeros(3, bool), CLEARLY)) == 0
+    assert float(asked(device, points, jnp.zeros(3, bool), CLEARLY)) == 0
 
 
 # --- registration -------------------------------------------------------------------------------------------
@@ -157,7 +164,7 @@ def test_what_is_looked_through_is_a_share_of_real_points(sight):
 
 def surfaces_of(points):
     cloud = jnp.asarray(points, jnp.float32)
-    return whole_surface(cloud, jnp.ones(len(cloud), bool))
+    return surface_of(cloud, jnp.ones(len(cloud), bool))
 
 
 def on_the_device(sight):
@@ -171,10 +178,10 @@ def test_a_pose_in_front_of_what_was_seen_costs_and_the_right_one_does_not(sight
     nearer = jaxlie.SE3.from_translation(jnp.array([0.0, -0.3, 0.0]))
     poses = jax.tree.map(lambda *x: jnp.stack(x), still, nearer)
     face, search, seen = surfaces_of(FACE[::20]), ROBUST.registration.search, on_the_device(sight)
-    right, wrong = free_space_cost(poses, (face, face), (None, seen), search, "upright")
+    right, wrong = costs_of(poses, (face, face), (None, seen), search, "upright")
     assert right < 0.05 * search.free_weight and wrong > 0.45 * search.free_weight
-    _, back = free_space_cost(
-        jax.vmap(lambda T: T.inverse())(poses), (face, face), (seen, None), search, "upright"
+    _, back = costs_of(
+        jax.jit(jax.vmap(jaxlie.SE3.inverse))(poses), (face, face), (seen, None), search, "upright"
     )
     assert float(back) == pytest.approx(float(wrong), abs=1e-5)
     silent = dataclasses.replace(search, free_weight=0.0)
@@ -183,7 +190,7 @@ def test_a_pose_in_front_of_what_was_seen_costs_and_the_right_one_does_not(sight
         ((None, seen), silent, "upright"),
         ((None, seen), search, "free"),
     ):
-        assert not free_space_cost(poses, (face, face), sights, settings, motion).any()
+        assert not costs_of(poses, (face, face), sights, settings, motion).any()
 
 
 def test_robust_asks_for_it():

@@ -1,12 +1,15 @@
 """The table of nearest points against the exact nearest."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.spatial import KDTree
 
-from more2_jax.geometry.nearest_grid import look_up, nearest_grid
+from more2_jax.geometry import nearest_grid as table
 from more2_jax.geometry.transform import rescale
+
+nearest_grid, look_up = jax.jit(table.nearest_grid, static_argnums=2), jax.jit(table.look_up)
 
 
 @pytest.fixture(scope="module")
