@@ -13,11 +13,14 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
-from more2_jax.config import EvidenceMatcher
+from more2_jax.config import EvidenceMatcher, MotionModel
 from more2_jax.geometry.poses import Points, Pose, apply_pose
 from more2_jax.matching.assignment import FARTHEST_M
 from more2_jax.types import ObservedObject
 
+EXTENT_WEIGHT = 0.5  # of what both differ by in log extents, docs/developing/notebook/matching_evidence.md
+THIN_M = 0.02  # added to extents: noise makes a board as thick, and no log of nothing is asked
+HEIGHTS = (2.0, 98.0)  # percentiles between which a thing's height lies: masks hold some stray points
 ROWS_AT_ONCE = 512  # objects that are scored against all instances at a time
 # Where a scan's objects lie farther apart than this it is more than a room, and places tell much:
 ROOM_M = 15.0
@@ -33,6 +36,7 @@ class Signatures:
     inv: Float[np.ndarray, "n c"]  # F_inv, of unit length
     scale: Float[np.ndarray, " n"]  # F_s, meters
     center: Points  # mean points, in a frame that both scans share, as far as is known; meters
+    extent: Float[np.ndarray, "n 3"] | None = None  # log of meters, as `extent_of`; None: not compared
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,15 +54,34 @@ class Proposed:
         return Proposed(pairs=self.pairs[kept], likeness=self.likeness[kept], rank=self.rank[kept])
 
 
-def signatures(side: Sequence[ObservedObject], place: Pose | None = None) -> Signatures:
-    """Those of one scan's objects. `place`: how it lies in the frame that both share; by default as given."""
+def signatures(
+    side: Sequence[ObservedObject], place: Pose | None = None, motion: MotionModel | None = None
+) -> Signatures:
+    """Those of one scan's objects, with extents where `motion` says how objects may turn.
+
+    `place`: how the scan lies in the frame that both share; by default as given.
+    """
     inv = np.stack([np.asarray(o.embedding.inv, np.float64) for o in side])
     center = np.stack([o.points.mean(axis=0) for o in side])
     return Signatures(
         inv=inv / np.maximum(np.linalg.norm(inv, axis=1, keepdims=True), 1e-30),
         scale=np.array([float(o.embedding.scale) for o in side]),
         center=center if place is None else apply_pose(place, center),
+        extent=None if motion is None else np.stack([extent_of(o.points, motion) for o in side]),
     )
+
+
+def extent_of(points: Points, motion: MotionModel) -> Float[np.ndarray, "3"]:
+    """How far a thing reaches, log of meters, however it is turned: upright its height, and standard deviations along
+    the axes of its outline from above; else those along its own three axes, the least first.
+    """
+    centered = points - points.mean(axis=0)
+    if motion == "upright":
+        low, high = np.percentile(centered[:, 2], HEIGHTS)
+        spread = np.linalg.eigvalsh(centered[:, :2].T @ centered[:, :2] / len(points))
+        return np.log(THIN_M + np.array([high - low, *np.sqrt(np.maximum(spread, 0.0))]))
+    spread = np.linalg.eigvalsh(centered.T @ centered / len(points))
+    return np.log(THIN_M + np.sqrt(np.maximum(spread, 0.0)))
 
 
 def proposed(
@@ -66,12 +89,13 @@ def proposed(
     new: Sequence[ObservedObject],
     matcher: EvidenceMatcher,
     place: Pose | None = None,
+    motion: MotionModel = "upright",
 ) -> Proposed:
     """The pairs to align: `matcher.candidates` partners of every object and of every instance; 0: all pairs.
 
     In a building they are sought near the object first, as `place` (T_scene_scan) has it, and a few anywhere.
     """
-    a, b, count = signatures(old), signatures(new, place), matcher.candidates
+    a, b, count = signatures(old, None, motion), signatures(new, place, motion), matcher.candidates
     if not count or not is_building(a, b):
         return likeliest(a, b, count, matcher.size_weight)
     near = likeliest(a, b, count, matcher.size_weight, NEAR_M)
@@ -88,7 +112,7 @@ def likeliest(
 ) -> Proposed:
     """The `count` likeliest partners of every object and every instance, those within `near_m` before others; 0: all.
 
-    Likely is what looks alike, less a difference in size: F_inv and F_s. Of equals the first is taken.
+    Likely is what looks alike, less a difference in size: F_inv, F_s, extents if known. Of equals the first is taken.
     """
     n, m = len(a.scale), len(b.scale)
     of_object, of_instance = count or m, count or n
@@ -98,6 +122,8 @@ def likeliest(
         rows = np.arange(start, min(start + ROWS_AT_ONCE, n))
         likeness = a.inv[rows] @ b.inv.T
         score = likeness - size_weight * np.abs(np.log(a.scale[rows, None] / b.scale))
+        if a.extent is not None and b.extent is not None:
+            score -= EXTENT_WEIGHT * np.abs(a.extent[rows, None] - b.extent).sum(axis=-1)
         if near_m is not None:
             apart = np.linalg.norm(a.center[rows, None] - b.center, axis=-1)
             score = np.where(apart <= near_m, score, score - FAR)

@@ -1,11 +1,22 @@
 """Which pairs are worth aligning: by hand from the whole matrix of scores, in blocks, and by place in a building."""
 
+import dataclasses
+
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from more2_jax.config import EvidenceMatcher
 from more2_jax.matching import proposals
-from more2_jax.matching.proposals import NEAR_M, ROOM_M, Signatures, likeliest, proposed
+from more2_jax.matching.proposals import (
+    NEAR_M,
+    ROOM_M,
+    Signatures,
+    extent_of,
+    likeliest,
+    proposed,
+    signatures,
+)
 from more2_jax.types import Embedding, ObservedObject
 
 WEIGHT = 0.5
@@ -106,3 +117,50 @@ def test_what_was_carried_through_a_building_is_proposed():
     assert far.sum() > 30
     found = proposed(observed(a), observed(b), EvidenceMatcher(candidates=4, size_weight=WEIGHT))
     assert {(k, 59 - k) for k in range(60)} <= {tuple(p) for p in found.pairs.tolist()}
+
+
+def turned(points, R):
+    return points @ R.as_matrix().T + [3.0, -1.0, 0.5]
+
+
+@pytest.mark.parametrize("size", [[1.2, 0.6, 0.7], [0.3, 0.3, 1.6], [2.0, 0.9, 0.0], [0.0, 0.0, 0.0]])
+def test_extents_do_not_change_as_things_may_turn(size):
+    points = np.random.default_rng(0).uniform(-0.5, 0.5, (500, 3)) * size
+    about_z, any_way = Rotation.from_euler("z", 1.1), Rotation.random(random_state=2)
+    for motion, R in (("upright", about_z), ("free", about_z), ("free", any_way)):
+        there = extent_of(turned(points, R), motion)
+        np.testing.assert_allclose(there, extent_of(points, motion), atol=1e-3)
+        assert np.isfinite(there).all()
+    lying = extent_of(turned(points, Rotation.from_euler("x", 90, degrees=True)), "upright")
+    assert np.allclose(lying, extent_of(points, "upright"), atol=0.05) == (size == [0.0, 0.0, 0.0])
+
+
+@pytest.mark.parametrize("motion", ["upright", "free"])
+def test_what_codes_do_not_tell_extents_do(motion):
+    """Among many things of all shapes, every code like every other."""
+    rng = np.random.default_rng(3)
+    things = [
+        ObservedObject(
+            points=rng.uniform(-0.5, 0.5, (300, 3)) * rng.uniform(0.1, 2.0, 3),
+            embedding=Embedding(
+                inv=rng.normal(size=16), eqv=np.zeros((3, 1)), scale=np.ones(()), center=np.zeros(3)
+            ),
+        )
+        for _ in range(40)
+    ]
+    again = [
+        dataclasses.replace(
+            o,
+            points=turned(o.points, Rotation.from_euler("z", rng.uniform(0, 6))),
+            embedding=dataclasses.replace(o.embedding, inv=rng.normal(size=16)),
+        )
+        for o in things
+    ]
+    true = {(k, k) for k in range(40)}
+
+    def told(found):
+        return len(true & set(map(tuple, found.pairs.tolist())))
+
+    plain = likeliest(signatures(things), signatures(again), 8, WEIGHT)
+    by_extent = proposed(things, again, EvidenceMatcher(candidates=8, size_weight=WEIGHT), None, motion)
+    assert told(plain) < 24 and told(by_extent) > 36

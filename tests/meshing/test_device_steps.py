@@ -19,6 +19,19 @@ from more2_jax.meshing.observed_surface import ObservedSurface, fit_observed_sur
 
 SIZE, CELLS, HALF = 700, 32, np.float32(0.65)
 STEP = 2 * float(HALF) / CELLS
+# Compiled: one by one, their operations would take longer.
+nearest_of, slopes_with = jax.jit(nearest_neighbors, static_argnums=2), jax.jit(with_slopes)
+inliers_of, planes_of = jax.jit(inliers), jax.jit(device_planes.fit_planes)
+free_along, signs_of = jax.jit(free_distance, static_argnums=3), jax.jit(outward_signs)
+nearest_of_corners = jax.jit(lattice.nearest_on_lattice, static_argnums=2)
+drawn_to, areas_of = jax.jit(corrected, static_argnums=(2, 4)), jax.jit(device_planes.surface_areas)
+screened_by = jax.jit(device_screened.screened_poisson, static_argnums=8)
+upsampled = jax.jit(lattice.upsampled)
+median_of, evenly_of, places_of = (
+    jax.jit(masked_median),
+    jax.jit(evenly, static_argnums=1),
+    jax.jit(true_places, static_argnums=1),
+)
 
 
 def box_cloud(count, rng, noise=0.0):
@@ -53,7 +66,7 @@ def padded(rows, fill=0.0):
 
 
 def real(points):
-    return jnp.arange(SIZE) < len(points)
+    return np.arange(SIZE) < len(points)
 
 
 def searched(points):
@@ -65,20 +78,27 @@ def searched(points):
 @pytest.mark.parametrize("name", CLOUDS)
 def test_neighbors_are_as_far_as_by_tree(name):
     points = CLOUDS[name]
-    distance, index = nearest_neighbors(jnp.asarray(padded(points)), real(points), 12)
+    distance, index = nearest_of(padded(points), real(points), 12)
+    distance = np.asarray(distance)
     np.testing.assert_allclose(distance[: len(points)], KDTree(points).query(points, k=12)[0], atol=1e-6)
     assert (np.asarray(index)[: len(points)] < len(points)).all()
     apart = np.linalg.norm(points[:, None] - points[np.asarray(index)[: len(points)]], axis=2)
     np.testing.assert_allclose(distance[: len(points)], apart, atol=1e-6)
 
 
+@jax.jit
+@jax.grad
+def slopes_of_distances(x, weights, fixed, index, known):
+    return (weights * with_slopes(fixed, x, index, known)).sum()
+
+
 @pytest.mark.parametrize("name", CLOUDS)
 def test_distances_of_neighbors_are_the_same_with_slopes_by_both_points(name):
-    x, known = jnp.asarray(padded(CLOUDS[name])), real(CLOUDS[name])
-    fixed, index = nearest_neighbors(x, known, 12)
-    np.testing.assert_array_equal(with_slopes(fixed, x, index, known), fixed)
+    x, known = padded(CLOUDS[name]), real(CLOUDS[name])
+    fixed, index = nearest_of(x, known, 12)
+    np.testing.assert_array_equal(slopes_with(fixed, x, index, known), fixed)
     weights = np.random.default_rng(0).normal(size=fixed.shape)
-    slope = jax.grad(lambda x: (weights * with_slopes(fixed, x, index, known)).sum())(x)
+    slope = slopes_of_distances(x, weights, fixed, index, known)
     apart = np.asarray(x, np.float64)[:, None] - np.asarray(x, np.float64)[np.asarray(index)]
     length = np.linalg.norm(apart, axis=2, keepdims=True)
     told = (length > 0) & np.asarray(known)[:, None, None] & np.asarray(known)[np.asarray(index)][..., None]
@@ -92,7 +112,7 @@ def test_distances_of_neighbors_are_the_same_with_slopes_by_both_points(name):
 @pytest.mark.parametrize("name", CLOUDS)
 def test_outliers_are_the_same(name, factor):
     points = CLOUDS[name]
-    kept = np.asarray(inliers(jnp.asarray(padded(points)), real(points), jnp.float32(factor)))
+    kept = np.asarray(inliers_of(padded(points), real(points), np.float32(factor)))
     expected = outliers.inliers(points, factor)
     assert not kept[len(points) :].any()
     close = np.abs(outliers.outlier_factors(points) - factor) < 1e-4
@@ -106,7 +126,7 @@ def test_planes_are_the_same_but_for_their_sign(name):
     points = CLOUDS[name]
     _, near, _, neighbors = searched(points)
     host = planes.fit_planes(points, near)
-    found = device_planes.fit_planes(jnp.asarray(padded(points)), real(points), jnp.asarray(neighbors))
+    found = planes_of(padded(points), real(points), neighbors)
     residual = np.sqrt(max(np.median(host.residual_variance), 0))
     noiseless = residual < 0.1 * np.sqrt(np.median(host.total_variance))
     assert bool(found.noiseless) == noiseless == (name in ("box", "plane"))
@@ -131,7 +151,7 @@ def slope_of_normals(points):
 @pytest.mark.parametrize("place", [0.0, 1e-8, 0.1])
 def test_normals_of_neighbors_however_close_have_finite_slopes(place, spread):
     noise = np.random.default_rng(0).normal(size=(40, 3))
-    slope = np.asarray(slope_of_normals(jnp.asarray(place + spread * noise, jnp.float32)))
+    slope = np.asarray(slope_of_normals((place + spread * noise).astype(np.float32)))
     assert np.isfinite(slope).all() and (np.abs(slope).max() > 0) == (spread > 1e-6)
 
 
@@ -143,7 +163,7 @@ def test_rays_go_as_far_as_by_tree(lowest, slope):
     _, _, d, neighbors = searched(points)
     cloud = Cloud(
         points=jnp.asarray(padded(points)),
-        mask=real(points),
+        mask=jnp.asarray(real(points)),
         distance=jnp.asarray(d),
         neighbors=jnp.asarray(neighbors),
         gap=jnp.float32(0.1),
@@ -151,7 +171,7 @@ def test_rays_go_as_far_as_by_tree(lowest, slope):
     )
     for way in (outward, -outward, np.roll(outward, 1, axis=1)):
         expected = normal_orientation.free_distance(KDTree(points), points, way, 0.1, lowest, slope)
-        found = free_distance(cloud, jnp.asarray(points, jnp.float32), jnp.asarray(way, jnp.float32), slope)
+        found = free_along(cloud, points.astype(np.float32), way.astype(np.float32), slope)
         assert np.isclose(found, expected, rtol=1e-5).mean() > 0.995  # but for points on a cone's border
     assert (expected < 1).mean() > 0.2
 
@@ -178,7 +198,7 @@ def test_sides_are_the_same(known):
     )
     cloud = Cloud(
         points=jnp.asarray(padded(points)),
-        mask=real(points),
+        mask=jnp.asarray(real(points)),
         distance=jnp.asarray(d),
         neighbors=jnp.asarray(neighbors),
         gap=jnp.float32(0.1),
@@ -189,7 +209,7 @@ def test_sides_are_the_same(known):
         normals=padded(sides if known == "normals" else np.zeros_like(sides)),
         known=jnp.asarray(known != "nothing"),
     )
-    found = jax.jit(outward_signs)(cloud, jnp.asarray(padded(normal)), jnp.asarray(padded(slope)), views)
+    found = signs_of(cloud, padded(normal), padded(slope), views)
     assert (np.asarray(found)[:600] == expected).mean() > 0.995
     assert 0.2 < (expected > 0).mean() < 0.8
 
@@ -197,7 +217,7 @@ def test_sides_are_the_same(known):
 @pytest.mark.parametrize("name", CLOUDS)
 def test_corners_know_their_nearest_points(name):
     points = CLOUDS[name]
-    found = lattice.nearest_on_lattice(jnp.asarray(padded(points)), real(points), CELLS, jnp.asarray(HALF))
+    found = nearest_of_corners(padded(points), real(points), CELLS, HALF)
     corners = grid.cube(CELLS, float(HALF)).corners()
     index = np.asarray(found).ravel()
     assert index.max() < len(points)
@@ -214,7 +234,7 @@ def oriented(points, normal):
     assert isinstance(surface, ObservedSurface)
     same = OrientedPlanes(
         points=jnp.asarray(padded(points)),
-        mask=real(points),
+        mask=jnp.asarray(real(points)),
         center=jnp.asarray(padded(surface.center)),
         normal=jnp.asarray(padded(surface.normal)),
         distance=jnp.asarray(padded(surface.distance)),
@@ -234,9 +254,7 @@ def test_values_are_drawn_to_the_same_planes(noise):
     corners = grid.cube(CELLS, float(HALF)).corners()
     field = np.linalg.norm(corners, axis=1) - 0.3
     expected = surface.corrected(corners, field)
-    drawn = corrected(
-        jnp.asarray(field.reshape((CELLS + 1,) * 3), jnp.float32), same, CELLS, jnp.asarray(HALF), 0.03
-    )
+    drawn = drawn_to(field.reshape((CELLS + 1,) * 3).astype(np.float32), same, CELLS, HALF, 0.03)
     off = np.abs(np.asarray(drawn).ravel() - expected)
     assert (np.abs(expected - field) > 1e-3).sum() > 1000
     assert (off < 1e-4).mean() > 0.995
@@ -248,18 +266,18 @@ def test_the_screened_equation_is_the_same():
     space = grid.cube(CELLS, float(HALF))
     field = np.linalg.norm(space.corners(), axis=1).reshape(space.shape) - 0.3
     areas = screened_poisson.surface_areas(points, surface.normal, surface.distance, surface.neighbors)
-    area = device_planes.surface_areas(same.points, same.normal, same.distance, same.neighbors)
-    np.testing.assert_allclose(area[:600], areas, rtol=1e-3)
+    area = areas_of(same.points, same.normal, same.distance, same.neighbors)
+    np.testing.assert_allclose(np.asarray(area)[:600], areas, rtol=1e-3)
     expected = screened_poisson.screened_poisson(field, space, points, surface.normal, areas, 0.1)
-    found = device_screened.screened_poisson(
-        jnp.asarray(field, jnp.float32),
+    found = screened_by(
+        field.astype(np.float32),
         same.points,
         same.mask,
         same.normal,
         area,
-        jnp.asarray(HALF),
-        jnp.float32(STEP),
-        jnp.float32(0.1),
+        HALF,
+        np.float32(STEP),
+        np.float32(0.1),
         0.1,
     )
     assert np.abs(expected - field)[np.abs(field) < STEP].max() > 0.5 * STEP
@@ -268,18 +286,18 @@ def test_the_screened_equation_is_the_same():
 
 def test_interpolation_is_the_same():
     x = np.random.default_rng(0).normal(size=(5, 6, 7))
-    np.testing.assert_allclose(lattice.upsampled(jnp.asarray(x)), grid.upsampled(x), atol=1e-6)
+    np.testing.assert_allclose(upsampled(x), grid.upsampled(x), atol=1e-6)
 
 
 @pytest.mark.parametrize("count", [0, 1, 2, 7, 10])
 def test_statistics_of_real_rows_alone(count):
     x, mask = np.random.default_rng(0).normal(size=10).astype(np.float32), np.arange(10) < count
     expected = np.median(x[mask]) if count else 0.0
-    assert float(masked_median(jnp.asarray(x), jnp.asarray(mask))) == pytest.approx(expected)
-    row, taken = evenly(jnp.asarray(count), 4)
+    assert float(median_of(x, mask)) == pytest.approx(expected)
+    row, taken = evenly_of(np.asarray(count), 4)
     np.testing.assert_array_equal(
         np.asarray(row)[np.asarray(taken)], np.linspace(0, count - 1, min(count, 4)).astype(int)
     )
-    places, counts = true_places(jnp.asarray(mask[::-1]), 4)
+    places, counts = places_of(mask[::-1], 4)
     np.testing.assert_array_equal(np.asarray(places)[: min(count, 4)], np.flatnonzero(mask[::-1])[:4])
     assert counts[-1] == count

@@ -27,6 +27,8 @@ from more2_jax.meshing.unseen import (
 )
 from more2_jax.types import AccumulatedObject, Embedding
 
+# Compiled: one by one, its operations would take longer.
+raised_by_device = jax.jit(raised_on_device)
 REACH = 0.03
 CONFIG = MeshingConfig(coarse_resolution=16, resolution=64, mls_bandwidth=REACH)
 RISE = 0.5
@@ -173,7 +175,7 @@ def planes_of(surface, fillers):
     arrays = [padded(np.asarray(x)) for x in (surface.points, surface.center, surface.normal)]
     return OrientedPlanes(
         points=jnp.asarray(arrays[0], jnp.float32),
-        mask=jnp.arange(len(arrays[0])) < len(surface.points),
+        mask=jnp.asarray(np.arange(len(arrays[0])) < len(surface.points)),
         center=jnp.asarray(arrays[1], jnp.float32),
         normal=jnp.asarray(arrays[2], jnp.float32),
         distance=jnp.asarray(padded(surface.distance), jnp.float32),
@@ -193,21 +195,21 @@ def test_the_device_raises_as_the_host_does(count, fillers):
     queries = lattice.corners()
     field = (0.3 * np.linalg.norm(queries, axis=1) - 0.1).astype(np.float32)
     expected = raised(surface, queries, field, RISE)
-    grid = jnp.asarray(field).reshape(lattice.shape)
-    found = raised_on_device(planes_of(surface, fillers), grid, jnp.float32(0.65), jnp.float32(RISE))
+    grid = field.reshape(lattice.shape)
+    found = raised_by_device(planes_of(surface, fillers), grid, np.float32(0.65), np.float32(RISE))
     np.testing.assert_allclose(np.asarray(found).ravel(), expected, atol=1e-4)
     assert np.abs(expected - field).max() == pytest.approx(RISE * RISE_REACH)
+
+
+@jax.jit
+@jax.grad
+def slope_of_total(points, planes, *given):
+    return raised_on_device(dataclasses.replace(planes, points=points), *given).sum()
 
 
 def test_slopes_are_finite_where_a_corner_is_a_point():
     points = np.concatenate([sphere(300), cube(16, 0.65).corners()[2000:2001]])
     surface = fit_observed_surface(points, points, REACH)
-    planes, grid = planes_of(surface, 3), jnp.full((17, 17, 17), -0.01)
-
-    def total(points):
-        return raised_on_device(
-            dataclasses.replace(planes, points=points), grid, jnp.float32(0.65), jnp.float32(RISE)
-        ).sum()
-
-    slope = jax.jit(jax.grad(total))(planes.points)
+    planes, grid = planes_of(surface, 3), np.full((17, 17, 17), -0.01, np.float32)
+    slope = np.asarray(slope_of_total(planes.points, planes, grid, np.float32(0.65), np.float32(RISE)))
     assert np.isfinite(slope).all() and np.abs(slope).max() > 0

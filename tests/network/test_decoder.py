@@ -1,6 +1,7 @@
 """Ψ: the folded affine form is the plain one, smooth enough to descend, random only while training."""
 
 import dataclasses
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -17,8 +18,13 @@ from more2_jax.types import Embedding
 from train.run.settings import TrainingRun
 
 CONFIGS = ROOT / "configs"
+# Compiled: one by one, their operations would take longer.
+distance, field_of, distance_in = jax.jit(sdf_one), jax.jit(object_field), jax.jit(field_sdf)
+slopes_of = jax.jit(jax.grad(lambda prior, code, points: sdf_one(prior, code, points).sum(), argnums=(2, 1)))
+rounded_product = jax.jit(bfloat16_product)
 
 
+@partial(jax.jit, static_argnames=("channels", "seed"))
 def random_code(channels: int, seed: int = 0) -> Embedding:
     k_inv, k_eqv = jax.random.split(jax.random.key(seed))
     eqv = jax.random.normal(k_eqv, (3, channels))
@@ -62,9 +68,9 @@ def test_folded_form_equals_the_plain_form(prior):
     points = np.random.default_rng(0).normal(size=(50, 3)).astype(np.float32)
     expected = plain(prior, code, points)
     assert np.ptp(expected) > 0.01
-    np.testing.assert_allclose(sdf_one(prior, code, jnp.asarray(points)), expected, atol=1e-5)
-    field = object_field(prior, code)  # built once, asked in parts
-    parts = [field_sdf(prior, field, jnp.asarray(p)) for p in np.split(points, 5)]
+    np.testing.assert_allclose(distance(prior, code, points), expected, atol=1e-5)
+    field = field_of(prior, code)  # built once, asked in parts
+    parts = [distance_in(prior, field, p) for p in np.split(points, 5)]
     np.testing.assert_allclose(np.concatenate(parts), expected, atol=1e-5)
 
 
@@ -74,7 +80,7 @@ def test_folded_form_equals_the_oracle_in_published_layout():
     points = np.random.default_rng(0).normal(size=(50, 3)).astype(np.float32)
     published = {"F_inv": code.inv, "F_eqv": code.eqv.T, "F_s": code.scale, "F_c": code.center}
     expected = oracles.decode(weights, {k: np.asarray(v, np.float64) for k, v in published.items()}, points)
-    ours = sdf_one(prior_from_published(weights, "test"), code, jnp.asarray(points))
+    ours = distance(prior_from_published(weights, "test"), code, points)
     np.testing.assert_allclose(ours, expected, atol=1e-5)
 
 
@@ -89,29 +95,25 @@ def test_distance_turns_scales_and_shifts_with_the_code(prior):
     )
     moved = Embedding(
         inv=code.inv,
-        eqv=jnp.asarray(rotation @ code.eqv, jnp.float32),
-        scale=scale * code.scale,
-        center=jnp.asarray(scale * rotation @ code.center + shift, jnp.float32),
+        eqv=jnp.asarray(rotation @ np.asarray(code.eqv), jnp.float32),
+        scale=jnp.float32(scale * float(code.scale)),
+        center=jnp.asarray(scale * rotation @ np.asarray(code.center) + shift, jnp.float32),
         origin=code.origin,
     )
-    ours = sdf_one(prior, moved, jnp.asarray(scale * points @ rotation.T + shift, jnp.float32))
-    np.testing.assert_allclose(ours, sdf_one(prior, code, jnp.asarray(points)), atol=2e-5)
+    ours = distance(prior, moved, (scale * points @ rotation.T + shift).astype(np.float32))
+    np.testing.assert_allclose(ours, distance(prior, code, points), atol=2e-5)
 
 
 def test_gradient_is_finite_at_the_center(prior):
     code = random_code(prior.config.encoder.code)
-
-    def total(points: jax.Array, code: Embedding) -> jax.Array:
-        return sdf_one(prior, code, points).sum()
-
-    by_point, by_code = jax.grad(total, argnums=(0, 1))(code.center[None], code)
+    by_point, by_code = slopes_of(prior, code, np.asarray(code.center)[None])
     assert np.isfinite(by_point).all()
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(by_code))
 
 
 def test_distance_is_finite_far_away(prior):
     code = random_code(prior.config.encoder.code)
-    far = sdf_one(prior, code, jnp.array([[1e6, 0, 0], [0, -1e6, 1e6]]))
+    far = np.asarray(distance(prior, code, np.float32([[1e6, 0, 0], [0, -1e6, 1e6]])))
     assert np.isfinite(far).all() and (np.abs(far) <= 1).all()
 
 
@@ -142,11 +144,11 @@ def test_sdf_takes_points_of_the_scan_far_from_zero(tiny_prior):
     """Batched, with float64 origins: a kilometer away gives the same distances."""
     code = random_code(16)
     origin = np.array([[1000.0, -2000.0, 30.0]])
-    batch = jax.tree.map(lambda x: jnp.asarray(x)[None], code)
+    batch = jax.tree.map(lambda x: jnp.asarray(np.asarray(x)[None]), code)
     points = np.random.default_rng(0).normal(size=(1, 20, 3))
     far = Embedding(inv=batch.inv, eqv=batch.eqv, scale=batch.scale, center=batch.center, origin=origin)
-    near = sdf_one(tiny_prior, code, jnp.asarray(points[0], jnp.float32))
-    np.testing.assert_allclose(sdf(tiny_prior, far, points + origin[:, None])[0], near, atol=1e-6)
+    near = distance(tiny_prior, code, points[0].astype(np.float32))
+    np.testing.assert_allclose(np.asarray(sdf(tiny_prior, far, points + origin[:, None]))[0], near, atol=1e-6)
     with pytest.raises(ValueError, match=r"needed \(objects, n, 3\)"):
         sdf(tiny_prior, far, np.repeat(points, 2, axis=0))
 
@@ -171,5 +173,5 @@ def test_rounded_products_have_three_digits():
         jax.random.normal(jax.random.key(1), (256, 64)),
     )
     exact = np.asarray(h, np.float64) @ np.asarray(kernel, np.float64)
-    error = np.abs(bfloat16_product(h, kernel) - exact) / np.sqrt(256)
+    error = np.abs(np.asarray(rounded_product(h, kernel)) - exact) / np.sqrt(256)
     assert 1e-5 < error.max() < 0.02 and error.mean() < 0.003

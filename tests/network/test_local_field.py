@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -10,6 +11,7 @@ import jaxlie
 import numpy as np
 import pytest
 from places import ROOT
+from scipy.spatial.transform import Rotation
 
 from more2_jax.config import load_config, preset
 from more2_jax.geometry.transform import rescale, transform
@@ -30,9 +32,14 @@ from more2_jax.types import Anchors, Instance, Scan
 from train.run.settings import TrainingRun
 
 CHANNELS, BANDWIDTHS, INPUTS = 4, (0.1, 0.3), 6
+# Compiled: one by one, their operations would take longer.
 encoded, distance = jax.jit(encode_one), jax.jit(sdf_one)
+offsets, placed_by = jax.jit(plane_offsets), jax.jit(lambda e, T, scale: transform(rescale(e, scale), T))
+moved_by = jax.jit(lambda T, points: jax.vmap(lambda p: T @ (2.5 * p))(points))
+turned_by = jax.jit(lambda T, rows: jax.vmap(lambda n: T.rotation() @ n)(rows))
 
 
+@partial(jax.jit, static_argnames=("count", "seed"))
 def random_anchors(count: int, seed: int = 0) -> Anchors:
     k_offset, k_features = jax.random.split(jax.random.key(seed))
     features = jax.random.normal(k_features, (count, 3, INPUTS))
@@ -46,7 +53,9 @@ def random_anchors(count: int, seed: int = 0) -> Anchors:
 @pytest.fixture(scope="module")
 def lookup():
     module = LocalLookup(CHANNELS, BANDWIDTHS, INPUTS)
-    params = module.init(jax.random.key(1), random_anchors(5), jnp.float32(1.0), method="tabulate")
+    params = jax.jit(lambda *given: module.init(*given, method="tabulate"))(
+        jax.random.key(1), random_anchors(5), jnp.float32(1.0)
+    )
 
     @jax.jit
     def asked(params, anchors: Anchors, scale: jax.Array, q: jax.Array) -> jax.Array:
@@ -108,14 +117,14 @@ def test_masked_anchors_change_nothing(lookup):
     q = np.random.default_rng(1).uniform(-0.6, 0.6, (10, 3))
     few = random_anchors(12)
     junk = random_anchors(7, seed=5)
-    more = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), few, junk)
-    more = dataclasses.replace(more, mask=jnp.arange(19) < 12)
+    more = jax.tree.map(lambda a, b: np.concatenate([a, b]), few, junk)
+    more = dataclasses.replace(more, mask=np.arange(19) < 12)
     np.testing.assert_allclose(ask(more, 1.0, q), ask(few, 1.0, q), atol=1e-5)
 
 
 def test_duplicate_anchors_count_as_weight_and_stay_finite(lookup):
     params, ask = lookup
-    one = jax.tree.map(lambda x: jnp.repeat(x[:1], 9, axis=0), random_anchors(1))
+    one = jax.tree.map(lambda x: np.repeat(x[:1], 9, axis=0), random_anchors(1))
     q = np.concatenate([np.asarray(one.offset[:1]), [[0.0, 0.0, 0.0], [50.0, 0.0, 0.0]]])
     got = ask(one, 1.0, q)
     assert np.isfinite(got).all()
@@ -128,8 +137,8 @@ def test_across_is_the_signed_distance_from_a_plane():
     disc = np.random.default_rng(0).normal(size=(20_000, 3)) * [0.1, 0.1, 0.0]
     q = np.array([[0.05, -0.08, 0.03], [0.2, 0.0, -0.01], [0.0, 0.0, 0.0]])
     second = np.einsum("ai,aj->ij", disc, disc) / len(disc)
-    tiled = (jnp.asarray(np.tile(x, (3, *[1] * x.ndim)), jnp.float32) for x in (disc.mean(axis=0), second))
-    _, across, spread = plane_offsets(jnp.asarray(q, jnp.float32), *tiled)
+    tiled = (np.tile(x, (3, *[1] * x.ndim)).astype(np.float32) for x in (disc.mean(axis=0), second))
+    _, across, spread = offsets(q.astype(np.float32), *tiled)
     np.testing.assert_allclose(across, q * [0, 0, 1], atol=3e-3)
     np.testing.assert_allclose(spread, 0.02, rtol=0.03)
 
@@ -143,31 +152,32 @@ def prior():
 
 @pytest.fixture(scope="module")
 def cloud():
-    return jnp.asarray(np.random.default_rng(4).uniform(-0.5, 0.5, (200, 3)) * [1.0, 0.6, 0.4], jnp.float32)
+    return (np.random.default_rng(4).uniform(-0.5, 0.5, (200, 3)) * [1.0, 0.6, 0.4]).astype(np.float32)
 
 
-def test_field_moves_and_grows_with_the_cloud(prior, cloud):
+@pytest.fixture(scope="module")
+def pose():
+    turn = Rotation.random(random_state=0).as_quat(scalar_first=True)
+    return jaxlie.SE3(np.r_[turn, 3.0, -2.0, 1.0].astype(np.float32))
+
+
+def test_field_moves_and_grows_with_the_cloud(prior, cloud, pose):
     """SDF(sRp + t; Φ(sRX + t)) = SDF(p; Φ(X)): encoding the moved cloud or moving its embedding."""
-    T = jaxlie.SE3.from_rotation_and_translation(
-        jaxlie.SO3.sample_uniform(jax.random.key(0)), jnp.array([3.0, -2.0, 1.0])
-    )
-    mask, queries = jnp.ones(len(cloud), bool), 1.2 * cloud[:40]
+    mask, queries = np.ones(len(cloud), bool), 1.2 * cloud[:40]
     embedding = encoded(prior, cloud, mask)
     expected = distance(prior, embedding, queries)
     assert np.ptp(expected) > 0.01
-    moved = jax.vmap(lambda p: T @ (2.5 * p))
-    again = encoded(prior, moved(cloud), mask)
-    np.testing.assert_allclose(distance(prior, again, moved(queries)), expected, atol=5e-4)
+    again = encoded(prior, moved_by(pose, cloud), mask)
+    np.testing.assert_allclose(distance(prior, again, moved_by(pose, queries)), expected, atol=5e-4)
     # Moving the embedding is exact: in float64 nothing but rounding is left.
     with jax.enable_x64(True):
         exact_prior, e, exact_T, q = jax.tree.map(
-            lambda x: jnp.asarray(x, jnp.float64) if x.dtype == jnp.float32 else x,
-            (prior, embedding, T, queries),
+            lambda x: np.asarray(x, np.float64) if x.dtype == np.float32 else x,
+            (prior, embedding, pose, queries),
         )
         still = distance(exact_prior, e, q)
-        carried = transform(rescale(e, jnp.float64(2.5)), exact_T)
-        there = jax.vmap(lambda p: exact_T @ (2.5 * p))(q)
-        np.testing.assert_allclose(distance(exact_prior, carried, there), still, atol=1e-6)
+        carried = placed_by(e, exact_T, np.float64(2.5))
+        np.testing.assert_allclose(distance(exact_prior, carried, moved_by(exact_T, q)), still, atol=1e-6)
 
 
 @pytest.mark.slow
@@ -187,19 +197,21 @@ def test_gradients_are_finite_with_few_real_points(prior, cloud):
 # --- normals ------------------------------------------------------------------------------------------------
 
 
-placed, field = jax.jit(encode_one), jax.jit(sdf_one)
-
-
+@jax.jit
 def weights_of(q, position, bandwidth=0.1):
     """The blend's weights, every row summing to 1."""
     squared = jnp.sum((q[:, None] - position) ** 2, axis=-1)
     return jax.nn.softmax(-squared / (2 * bandwidth**2), axis=-1)
 
 
-def asked_planes(q, position, normal, near=0.015):
+@jax.jit
+def features_of(q, position, normal, near):
     weight = weights_of(q, position)
-    found = plane_features(q, weight, plane_rows(position, normal), jnp.float32(near), weight @ position)
-    return np.asarray(found, np.float64)
+    return plane_features(q, weight, plane_rows(position, normal), near, weight @ position)
+
+
+def asked_planes(q, position, normal, near=0.015):
+    return np.asarray(features_of(q, position, normal, jnp.float32(near)), np.float64)
 
 
 def unit_rows(rng, count):
@@ -210,9 +222,7 @@ def unit_rows(rng, count):
 def planes_one_by_one(q, position, normal, near=0.015):
     """Every query and every anchor of known normal in a loop, heights by subtraction, float64."""
     rows = []
-    for p, w in zip(
-        q, np.asarray(weights_of(jnp.asarray(q), jnp.asarray(position)), np.float64), strict=True
-    ):
+    for p, w in zip(q, np.asarray(weights_of(q, position), np.float64), strict=True):
         known = [j for j in range(len(position)) if normal[j].any()]
         heights = {j: normal[j] @ (p - position[j]) for j in known}
 
@@ -247,15 +257,15 @@ def test_plane_features_are_the_sums_over_known_anchors():
     rng = np.random.default_rng(0)
     q, position, normal = rng.uniform(-0.5, 0.5, (20, 3)), rng.uniform(-0.4, 0.4, (30, 3)), unit_rows(rng, 30)
     normal[rng.random(30) < 0.4] = 0
-    got = asked_planes(*(jnp.asarray(x, jnp.float32) for x in (q, position, normal)))
+    got = asked_planes(*(x.astype(np.float32) for x in (q, position, normal)))
     assert got.shape == (20, NORMAL_FEATURES)
     np.testing.assert_allclose(got, planes_one_by_one(q, position, normal), atol=2e-4)
 
 
 def test_nothing_known_is_nothing_said():
     rng = np.random.default_rng(1)
-    q, position = (jnp.asarray(rng.uniform(-0.5, 0.5, (9, 3)), jnp.float32) for _ in range(2))
-    for normal in (None, jnp.zeros((9, 3))):
+    q, position = (rng.uniform(-0.5, 0.5, (9, 3)).astype(np.float32) for _ in range(2))
+    for normal in (None, np.zeros((9, 3), np.float32)):
         assert not asked_planes(q, position, normal).any()
 
 
@@ -263,15 +273,16 @@ def test_heights_of_a_thin_board_have_the_sign_of_the_nearer_side():
     """Two sheets 0.03 apart facing away from one another: inside both blends are negative, outside positive."""
     side = np.stack(np.meshgrid(*[np.linspace(-0.3, 0.3, 25)] * 2), axis=-1).reshape(-1, 2)
     sheets = [np.c_[side, np.full(len(side), z)] for z in (-0.015, 0.015)]
-    position = jnp.asarray(np.concatenate(sheets), jnp.float32)
-    normal = jnp.asarray(np.repeat([[0.0, 0, -1], [0, 0, 1]], len(side), axis=0), jnp.float32)
+    position = np.concatenate(sheets).astype(np.float32)
+    normal = np.repeat(np.float32([[0, 0, -1], [0, 0, 1]]), len(side), axis=0)
     z = np.array([-0.05, -0.025, -0.01, 0.0, 0.01, 0.025, 0.05])
-    found = asked_planes(jnp.asarray(np.c_[0.01 + 0 * z, 0.02 + 0 * z, z], jnp.float32), position, normal)
+    q = np.c_[0.01 + 0 * z, 0.02 + 0 * z, z].astype(np.float32)
+    found = asked_planes(q, position, normal)
     inside = np.abs(z) < 0.015
     assert (found[inside][:, [1, 8]] < 0).all()
     assert (found[~inside][:, 8] > 0).all()
     # Outward turned inward changes the sign of every height and nothing else.
-    turned = asked_planes(jnp.asarray(np.c_[0.01 + 0 * z, 0.02 + 0 * z, z], jnp.float32), position, -normal)
+    turned = asked_planes(q, position, -normal)
     sign = np.array([1, -1, -1, -1, 1, -1, 1, 1, -1, -1, 1])
     np.testing.assert_allclose(turned, sign * found, atol=1e-5)
 
@@ -291,30 +302,28 @@ def seeing():
     return init_prior(dataclasses.replace(model, decoder=decoder), jax.random.key(3))
 
 
-def test_a_field_with_normals_moves_with_the_object_and_depends_on_them(seeing, cloud):
-    normals = jnp.asarray(unit_rows(np.random.default_rng(5), len(cloud)), jnp.float32).at[::3].set(0.0)
-    T = jaxlie.SE3.from_rotation_and_translation(
-        jaxlie.SO3.sample_uniform(jax.random.key(0)), jnp.array([3.0, -2.0, 1.0])
-    )
-    mask, queries = jnp.ones(len(cloud), bool), 1.2 * cloud[:40]
-    embedding = placed(seeing, cloud, mask, normals)
-    expected = field(seeing, embedding, queries)
-    turned = jax.vmap(lambda n: T.rotation() @ n)(normals)
-    moved = jax.vmap(lambda p: T @ (2.5 * p))
-    again = placed(seeing, moved(cloud), mask, turned)
-    np.testing.assert_allclose(field(seeing, again, moved(queries)), expected, atol=5e-4)
-    carried = transform(rescale(embedding, 2.5), T)
-    np.testing.assert_allclose(field(seeing, carried, moved(queries)), expected, atol=5e-4)
-    for other in (-normals, jnp.zeros_like(normals)):
-        blind = placed(seeing, cloud, mask, other)
-        assert np.abs(field(seeing, blind, queries) - expected).max() > 1e-3
+def test_a_field_with_normals_moves_with_the_object_and_depends_on_them(seeing, cloud, pose):
+    normals = unit_rows(np.random.default_rng(5), len(cloud)).astype(np.float32)
+    normals[::3] = 0.0
+    mask, queries = np.ones(len(cloud), bool), 1.2 * cloud[:40]
+    embedding = encoded(seeing, cloud, mask, normals)
+    expected = distance(seeing, embedding, queries)
+    there = moved_by(pose, queries)
+    again = encoded(seeing, moved_by(pose, cloud), mask, turned_by(pose, normals))
+    np.testing.assert_allclose(distance(seeing, again, there), expected, atol=5e-4)
+    carried = placed_by(embedding, pose, jnp.float32(2.5))
+    np.testing.assert_allclose(distance(seeing, carried, there), expected, atol=5e-4)
+    for other in (-normals, np.zeros_like(normals)):
+        blind = encoded(seeing, cloud, mask, other)
+        assert np.abs(distance(seeing, blind, queries) - expected).max() > 1e-3
         for name in ("inv", "eqv", "scale", "center"):  # codes are of positions alone
             np.testing.assert_array_equal(getattr(blind, name), getattr(embedding, name))
 
 
 @pytest.mark.slow
 def test_gradients_with_normals_are_finite_where_few_are_known(seeing, cloud):
-    mask, normals = jnp.arange(len(cloud)) < 20, jnp.zeros_like(cloud).at[0, 2].set(1.0)
+    mask, normals = np.arange(len(cloud)) < 20, np.zeros_like(cloud)
+    normals[0, 2] = 1.0
 
     def total(params, points, mask, normals):
         weights = dataclasses.replace(seeing, params=params)

@@ -31,8 +31,23 @@ FROZEN = dataclasses.replace(
 )
 
 
+# Compiled: one by one, their operations would take longer.
+loss_of, drift_of = jax.jit(surface_loss), jax.jit(code_drift)
+slope_of_drift = jax.jit(jax.grad(lambda inv, code: code_drift(dataclasses.replace(code, inv=inv), code)))
+placed, scaled = jax.jit(transform), jax.jit(rescale)
+pose_of = jax.jit(jaxlie.SE3.from_matrix)
+thinned, radius_of = jax.jit(joint.subsample, static_argnums=1), jax.jit(joint.cloud_radius)
+all_after = jax.jit(lambda G, poses: jax.vmap(jax.vmap(lambda T: G @ T))(poses))
+all_placed = jax.jit(jax.vmap(transform, in_axes=(0, None)))
+
+
 def pose_group(T):
-    return jaxlie.SE3.from_matrix(jnp.asarray(T, jnp.float32))
+    return pose_of(np.asarray(T, np.float32))
+
+
+def rows(tree, *index):
+    """Those of every array of a record."""
+    return jax.tree.map(lambda x: jnp.asarray(np.asarray(x)[index]), tree)
 
 
 @pytest.fixture(scope="module")
@@ -51,10 +66,10 @@ def seen(tiny_prior):
             poses.append(np.asarray(pose_group(T).wxyz_xyz))
     batch = pad_clouds(clouds, 256)
     codes = dataclasses.replace(encode(tiny_prior, batch), origin=None)
-    real = jnp.arange(SEEN)[None].repeat(OBJECTS, axis=0) < SEEN - 1
+    real = jnp.asarray(np.arange(SEEN)[None].repeat(OBJECTS, axis=0) < SEEN - 1)
 
     def split(x):
-        return jnp.asarray(x).reshape(OBJECTS, SEEN, *x.shape[1:])
+        return jnp.asarray(np.asarray(x).reshape(OBJECTS, SEEN, *x.shape[1:]))
 
     codes = jax.tree.map(split, codes)
     return Observations(
@@ -63,7 +78,7 @@ def seen(tiny_prior):
         real=real,
         codes=codes,
         T_ref_obs=jaxlie.SE3(split(np.stack(poses))),
-        accumulated=jax.tree.map(lambda x: x[:, 0], codes),
+        accumulated=rows(codes, slice(None), 0),
     )
 
 
@@ -78,58 +93,57 @@ def unmoved(tiny_prior, seen):
 
 
 def test_the_loss_never_ends_above_its_start(fit, unmoved):
-    assert bool((fit.loss < unmoved.loss).all())
+    assert (np.asarray(fit.loss) < np.asarray(unmoved.loss)).all()
 
 
 @pytest.mark.parametrize("start", ["best", "accumulated"])
 def test_no_step_is_the_loss_of_the_start_by_definition(tiny_prior, seen, start):
     config = dataclasses.replace(CONFIG, steps=0, start=start)
-    fit, loss_of = fit_jointly(tiny_prior, seen, config), jax.jit(surface_loss)
+    fit = fit_jointly(tiny_prior, seen, config)
     for n in range(OBJECTS):
-        one = joint.subsample(jax.tree.map(lambda x, n=n: x[n], seen), POINTS)
-        radius = joint.cloud_radius(one.points[0], one.mask[0])
-        one = rescale(one, 1 / radius)
+        one = thinned(rows(seen, n), POINTS)
+        radius = radius_of(*rows((one.points, one.mask), 0))
+        one = scaled(one, jnp.float32(1 / np.asarray(radius)))
         starts = [one.accumulated]
         if start == "best":
-            own = [jax.tree.map(lambda x, j=j: x[j], (one.codes, one.T_ref_obs)) for j in range(SEEN - 1)]
-            starts = [transform(code, T) for code, T in own]
+            starts = [placed(*rows((one.codes, one.T_ref_obs), j)) for j in range(SEEN - 1)]
         losses = [float(loss_of(tiny_prior, code, one.T_ref_obs, one)) for code in starts]
-        assert min(abs(float(fit.loss[n]) - loss) for loss in losses) < 1e-4 * max(losses)
+        assert min(abs(float(np.asarray(fit.loss)[n]) - loss) for loss in losses) < 1e-4 * max(losses)
 
 
 def test_the_reference_stays_where_it_is(fit):
     still = np.tile([1.0, 0, 0, 0, 0, 0, 0], (OBJECTS, 1))
-    np.testing.assert_allclose(fit.T_ref_obs.wxyz_xyz[:, 0], still, atol=1e-6)
+    np.testing.assert_allclose(np.asarray(fit.T_ref_obs.wxyz_xyz)[:, 0], still, atol=1e-6)
 
 
 def test_the_reference_stays_where_it_is_given(tiny_prior, seen, unmoved):
     """Of a scan that was leveled its pose is a tilt about a point; the loss is that of the level scan."""
-    G = jaxlie.SE3.from_rotation_and_translation(
-        jaxlie.SO3.from_x_radians(jnp.float32(0.09)), jnp.array([0.1, -0.3, 0.2], jnp.float32)
-    )
+    G = np.eye(4)
+    G[:3, :3], G[:3, 3] = Rotation.from_euler("x", 0.09).as_matrix(), [0.1, -0.3, 0.2]
+    G = pose_group(G)
     tilted = dataclasses.replace(
         seen,
-        T_ref_obs=jax.vmap(jax.vmap(lambda T: G @ T))(seen.T_ref_obs),
-        accumulated=jax.vmap(lambda code: transform(code, G))(seen.accumulated),
+        T_ref_obs=all_after(G, seen.T_ref_obs),
+        accumulated=all_placed(seen.accumulated, G),
     )
     given = np.broadcast_to(G.wxyz_xyz, (OBJECTS, 7))
     for config in (CONFIG, FROZEN):
         moved = fit_jointly(tiny_prior, tilted, config)
-        np.testing.assert_allclose(moved.T_ref_obs.wxyz_xyz[:, 0], given, atol=1e-6)
+        np.testing.assert_allclose(np.asarray(moved.T_ref_obs.wxyz_xyz)[:, 0], given, atol=1e-6)
     np.testing.assert_allclose(moved.loss, unmoved.loss, rtol=1e-4)
     np.testing.assert_allclose(moved.T_ref_obs.wxyz_xyz, tilted.T_ref_obs.wxyz_xyz, atol=1e-5)
 
 
 def test_without_a_step_size_nothing_moves(seen, unmoved):
     np.testing.assert_allclose(unmoved.T_ref_obs.wxyz_xyz, seen.T_ref_obs.wxyz_xyz, atol=1e-5)
-    codes = unmoved.embedding
+    codes = jax.device_get(unmoved.embedding)
     for n in range(OBJECTS):  # X*: the code of one of the observations, in the reference's frame
-        moved = [
-            transform(*jax.tree.map(lambda x, n=n, j=j: x[n, j], (seen.codes, seen.T_ref_obs)))
-            for j in range(SEEN - 1)
-        ]
+        moved = [placed(*rows((seen.codes, seen.T_ref_obs), n, j)) for j in range(SEEN - 1)]
         gaps = [
-            max(float(jnp.abs(getattr(codes, k)[n] - getattr(m, k)).max()) for k in ("inv", "eqv", "center"))
+            max(
+                float(np.abs(getattr(codes, k)[n] - np.asarray(getattr(m, k))).max())
+                for k in ("inv", "eqv", "center")
+            )
             for m in moved
         ]
         assert min(gaps) < 1e-4
@@ -137,30 +151,35 @@ def test_without_a_step_size_nothing_moves(seen, unmoved):
 
 def test_code_and_poses_move_with_a_step_size(seen, fit, unmoved):
     for name in ("inv", "eqv", "center"):
-        assert float(jnp.abs(getattr(fit.embedding, name) - getattr(unmoved.embedding, name)).max()) > 1e-5
-    assert float(jnp.abs(fit.T_ref_obs.wxyz_xyz - seen.T_ref_obs.wxyz_xyz)[:, 1:-1].max()) > 1e-4
+        assert (
+            np.abs(np.subtract(getattr(fit.embedding, name), getattr(unmoved.embedding, name))).max() > 1e-5
+        )
+    assert np.abs(np.subtract(fit.T_ref_obs.wxyz_xyz, seen.T_ref_obs.wxyz_xyz))[:, 1:-1].max() > 1e-4
 
 
 def test_what_stands_in_padding_changes_nothing(tiny_prior, seen, fit):
-    def dirty(x):
-        return x.at[:, -1].set(37.0)
+    def dirty(x, junk=37.0):
+        x = np.array(x)
+        x[:, -1] = junk
+        return jnp.asarray(x)
 
     other = dataclasses.replace(
         seen,
-        points=dirty(jnp.where(seen.mask[..., None], seen.points, 1e6)),
+        points=dirty(np.where(np.asarray(seen.mask)[..., None], seen.points, np.float32(1e6))),
         codes=jax.tree.map(dirty, seen.codes),
-        T_ref_obs=jaxlie.SE3(seen.T_ref_obs.wxyz_xyz.at[:, -1].set(jnp.array([0, 1.0, 0, 0, 5, 5, 5]))),
+        T_ref_obs=jaxlie.SE3(dirty(seen.T_ref_obs.wxyz_xyz, [0, 1, 0, 0, 5, 5, 5])),
     )
     again = fit_jointly(tiny_prior, other, CONFIG)
     np.testing.assert_allclose(again.loss, fit.loss, rtol=1e-4)
-    np.testing.assert_allclose(again.T_ref_obs.wxyz_xyz[:, :-1], fit.T_ref_obs.wxyz_xyz[:, :-1], atol=1e-4)
+    poses, expected = (np.asarray(x.T_ref_obs.wxyz_xyz)[:, :-1] for x in (again, fit))
+    np.testing.assert_allclose(poses, expected, atol=1e-4)
     np.testing.assert_allclose(again.embedding.eqv, fit.embedding.eqv, atol=1e-4)
 
 
 def test_an_object_alone_is_fitted_as_among_others(tiny_prior, seen, fit):
-    order = jnp.array([2, 0, 1])
-    mixed = fit_jointly(tiny_prior, jax.tree.map(lambda x: x[order], seen), CONFIG)
-    np.testing.assert_allclose(mixed.loss, fit.loss[order], rtol=1e-4)
+    order = np.array([2, 0, 1])
+    mixed = fit_jointly(tiny_prior, rows(seen, order), CONFIG)
+    np.testing.assert_allclose(mixed.loss, np.asarray(fit.loss)[order], rtol=1e-4)
 
 
 def test_an_object_without_reference_is_refused(tiny_prior, seen):
@@ -169,12 +188,13 @@ def test_an_object_without_reference_is_refused(tiny_prior, seen):
 
 
 def test_no_code_drift_costs_nothing_and_has_a_finite_gradient(seen):
-    code = jax.tree.map(lambda x: x[0], seen.accumulated)
-    assert float(code_drift(code, code)) < 1e-6
-    gradient = jax.grad(lambda x: code_drift(dataclasses.replace(code, inv=x), code))(code.inv)
-    assert bool(jnp.isfinite(gradient).all())
-    further = dataclasses.replace(code, inv=code.inv + 3.0 / np.sqrt(len(code.inv)))
-    assert float(code_drift(further, code)) == pytest.approx(3.0, rel=1e-4)
+    code = rows(seen.accumulated, 0)
+    assert float(drift_of(code, code)) < 1e-6
+    assert np.isfinite(slope_of_drift(code.inv, code)).all()
+    further = dataclasses.replace(
+        code, inv=jnp.asarray(np.asarray(code.inv) + np.float32(3 / np.sqrt(len(code.inv))))
+    )
+    assert float(drift_of(further, code)) == pytest.approx(3.0, rel=1e-4)
 
 
 @pytest.mark.parametrize("factor", [0.01, 1.0, 100.0])
@@ -184,9 +204,10 @@ def test_moving_the_code_is_encoding_what_was_moved(tiny_prior, factor):
     T = pieces.pose(rotation, factor * shift)
     moved = pieces.apply(T, factor * cloud)
     batch = pad_clouds([cloud, moved], 256)
-    before, after = (jax.tree.map(lambda x, k=k: x[k], encode(tiny_prior, batch)) for k in (0, 1))
+    both = encode(tiny_prior, batch)
+    before, after = (jax.tree.map(lambda x, k=k: np.asarray(x)[k], both) for k in (0, 1))
     plain = dataclasses.replace(before, center=before.center + before.origin.astype(np.float32), origin=None)
-    expected = transform(rescale(plain, jnp.float32(factor)), pose_group(T))
+    expected = placed(scaled(plain, jnp.float32(factor)), pose_group(T))
     np.testing.assert_allclose(after.inv, expected.inv, atol=1e-4)
     np.testing.assert_allclose(after.eqv, expected.eqv, atol=1e-4)
     assert float(after.scale) == pytest.approx(float(expected.scale), rel=1e-4)
