@@ -28,7 +28,7 @@ def test_the_drawing_shows_the_layers_of_the_contract():
 
 
 def test_the_walk_is_long_enough_to_reach_the_page():
-    assert len(walk()) == 32
+    assert len(walk()) == 33
     assert {"read_scan", "add_scan", "save_scene", "report_html"} <= {name for name, _ in walk()}
 
 
