@@ -153,7 +153,7 @@ def align_candidates(
     partners are sought (`proposals`), by default `T_scene_scan`. Raises ValueError as `check_asked` does.
     """
     T = np.eye(4) if T_scene_scan is None else T_scene_scan
-    worth = proposed(old, new, matcher, T if place is None else place, motion)
+    worth = proposed(old, new, matcher, T if place is None else place, motion=motion)
     return align_proposed(prior, (old, new), worth, matcher, motion, T, seen)
 
 

@@ -18,7 +18,7 @@ from more2_jax.geometry.poses import Points, Pose, apply_pose
 from more2_jax.matching.assignment import FARTHEST_M
 from more2_jax.types import ObservedObject
 
-EXTENT_WEIGHT = 0.5  # of what both differ by in log extents, docs/developing/notebook/matching_evidence.md
+EXTENT_WEIGHT = 0.5  # of what both differ by in log extents, docs/developing/notebook/proposals.md
 THIN_M = 0.02  # added to extents: noise makes a board as thick, and no log of nothing is asked
 HEIGHTS = (2.0, 98.0)  # percentiles between which a thing's height lies: masks hold some stray points
 ROWS_AT_ONCE = 512  # objects that are scored against all instances at a time
@@ -89,11 +89,13 @@ def proposed(
     new: Sequence[ObservedObject],
     matcher: EvidenceMatcher,
     place: Pose | None = None,
-    motion: MotionModel = "upright",
+    *,
+    motion: MotionModel,
 ) -> Proposed:
     """The pairs to align: `matcher.candidates` partners of every object and of every instance; 0: all pairs.
 
-    In a building they are sought near the object first, as `place` (T_scene_scan) has it, and a few anywhere.
+    In a building they are sought near the object first, as `place` (T_scene_scan) has it, and a few anywhere. `motion`
+    says how objects may turn, and so which extents stay.
     """
     a, b, count = signatures(old, None, motion), signatures(new, place, motion), matcher.candidates
     if not count or not is_building(a, b):

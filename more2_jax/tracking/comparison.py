@@ -137,7 +137,8 @@ class Comparison:
     def proposed_others(self, old: Sequence[ObservedObject], new: Sequence[ObservedObject]) -> Proposed:
         """The likeliest pairs of clouds that were not compared."""
         few = dataclasses.replace(self.matcher, candidates=CANDIDATES)
-        return proposed(old, new, few, self.identified.frame.T_scene_scan, self.config.motion)
+        place = self.identified.frame.T_scene_scan
+        return proposed(old, new, few, place, motion=self.config.motion)
 
     def align_others(
         self, clouds: tuple[Sequence[ObservedObject], Sequence[ObservedObject]], worth: Proposed

@@ -30,9 +30,8 @@ from more2_jax.tracking.split_masks import Balls, reach_m
 from more2_jax.types import Instance, SceneObject
 
 Pair = tuple[int, int]  # rows of an object and of an instance
-Clouds = tuple[
-    Sequence[Points], Sequence[Points]
-]  # objects, in the scene's frame, and instances, in the scan's
+# Objects, in the scene's frame, and instances, in the scan's.
+Clouds = tuple[Sequence[Points], Sequence[Points]]
 
 # Chosen on rooms of regimes `sparse` and `real`, docs/developing/notebook/mask_parts.md.
 LEAST_ON = 0.35  # share of either part that must lie on both parts of the other scan, in one pose
@@ -42,7 +41,7 @@ MOST_LOSS = 1.7  # log odds that both together may lose against the likelier par
 
 @dataclass(frozen=True, kw_only=True)
 class Crossing:
-    """Two pairs, an object and an instance each, that are one object: the first is what was found likelier."""
+    """Two pairs, an object and an instance each, that are one object. The first was found, the second perhaps not."""
 
     pairs: tuple[Pair, Pair]
     share: float  # of the part that lies least on the object
@@ -56,13 +55,12 @@ class Crossing:
 
 def join_crossed(whole: Regrouped, compared: Comparison) -> Regrouped | None:
     """Joins what is one object in two parts in both scans; None if there is none."""
-    chosen, taken = list[Crossing](), (set[int](), set[int]())
+    chosen, taken = list[Crossing](), set[tuple[int, int]]()
     for c in sorted(crossings(whole, compared), key=lambda c: -c.odds):
-        rows = [{pair[side] for pair in c.pairs} for side in (0, 1)]
-        if all(t.isdisjoint(r) for t, r in zip(taken, rows, strict=True)):
+        clouds = {(side, row) for pair in c.pairs for side, row in enumerate(pair)}
+        if taken.isdisjoint(clouds):  # every cloud once
             chosen.append(c)
-            for t, r in zip(taken, rows, strict=True):
-                t |= r
+            taken |= clouds
     if not chosen:
         return None
     objects_joined = with_objects_joined(whole, [c.join(0) for c in chosen], compared.prior)
@@ -99,7 +97,7 @@ def side_by_side(whole: Regrouped, compared: Comparison, clouds: Clouds) -> Iter
             if q == k or not others or not may_be_part(whole.objects, k, q):
                 continue
             if q in partner and q < k and may_be_part(whole.objects, q, k):
-                continue  # that way it was
+                continue  # it was, the other way round
             if touch(clouds[0][k], clouds[0][q]):
                 yield from (((k, i), (q, j)) for j in others if touch(clouds[1][i], clouds[1][j]))
 

@@ -28,14 +28,15 @@ def mends_of_masks(scene: LivingScene, scan: Scan) -> Iterator[Mend]:
         crossed.append(join_crossed(masks, compared))
         return crossed[-1]
 
+    def joined_anew(masks: Regrouped, compared: Comparison) -> Regrouped | None:
+        return join_parts(masks, compared) if any(crossed) else None  # the new wholes may have more parts
+
     def divided(masks: Regrouped, compared: Comparison) -> Regrouped | None:
         return divide_merged(masks, compared, next_number(masks.objects, scene.scans))
 
     yield join_parts
     yield joined
-    yield (
-        lambda masks, compared: join_parts(masks, compared) if any(crossed) else None
-    )  # wholes may have parts
+    yield joined_anew
     yield divided
     yield lambda masks, compared: divided(masks, compared) if masks.divided else None
     yield partial(join_smooth, scans=scene.scans, scan=scan)

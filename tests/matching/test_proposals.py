@@ -74,7 +74,9 @@ def test_in_a_room_places_say_nothing():
     far = np.eye(4)
     far[0, 3] = 100.0
     matcher = EvidenceMatcher(candidates=3, size_weight=WEIGHT)
-    here, there = (proposed(observed(a), observed(b), matcher, place) for place in (None, far))
+    here, there = (
+        proposed(observed(a), observed(b), matcher, place, motion="upright") for place in (None, far)
+    )
     np.testing.assert_array_equal(here.pairs, likeliest(a, b, 3, WEIGHT).pairs)
     np.testing.assert_array_equal(there.pairs, here.pairs)
 
@@ -103,10 +105,10 @@ def test_among_the_copies_of_a_building_what_stands_there_is_proposed():
     moved = np.eye(4)
     moved[:3, 3] = [7.0, -300.0, 2.0]
     elsewhere = Signatures(inv=b.inv, scale=b.scale, center=b.center - moved[:3, 3])
-    assert recall(proposed(observed(a), observed(b), matcher)) == 1.0
-    assert recall(proposed(observed(a), observed(elsewhere), matcher, moved)) == 1.0
+    assert recall(proposed(observed(a), observed(b), matcher, motion="upright")) == 1.0
+    assert recall(proposed(observed(a), observed(elsewhere), matcher, moved, motion="upright")) == 1.0
     # As given the two frames lie far apart: as many partners are proposed, by codes and sizes.
-    lost = proposed(observed(a), observed(elsewhere), matcher)
+    lost = proposed(observed(a), observed(elsewhere), matcher, motion="upright")
     assert (np.bincount(lost.pairs[:, 0]) >= 4).all()
 
 
@@ -115,7 +117,9 @@ def test_what_was_carried_through_a_building_is_proposed():
     b = Signatures(inv=a.inv[::-1], scale=a.scale[::-1], center=b.center)
     far = np.linalg.norm(a.center - b.center[::-1], axis=1) > NEAR_M
     assert far.sum() > 30
-    found = proposed(observed(a), observed(b), EvidenceMatcher(candidates=4, size_weight=WEIGHT))
+    found = proposed(
+        observed(a), observed(b), EvidenceMatcher(candidates=4, size_weight=WEIGHT), motion="upright"
+    )
     assert {(k, 59 - k) for k in range(60)} <= {tuple(p) for p in found.pairs.tolist()}
 
 
@@ -162,5 +166,5 @@ def test_what_codes_do_not_tell_extents_do(motion):
         return len(true & set(map(tuple, found.pairs.tolist())))
 
     plain = likeliest(signatures(things), signatures(again), 8, WEIGHT)
-    by_extent = proposed(things, again, EvidenceMatcher(candidates=8, size_weight=WEIGHT), None, motion)
+    by_extent = proposed(things, again, EvidenceMatcher(candidates=8, size_weight=WEIGHT), motion=motion)
     assert told(plain) < 24 and told(by_extent) > 36

@@ -70,7 +70,7 @@ def test_every_candidate_pair_is_searched_once_and_registration_searches_nothing
     codes = embed(tiny_prior, [i.points for i in second.instances])
     old, new = compared_objects(first, second.instances, codes, second, config)
     known = [o for o, _ in old]
-    worth = candidates.proposed(known, new, config.matching)
+    worth = candidates.proposed(known, new, config.matching, motion=config.motion)
     made = add_scan(tiny_prior, first, second, config)
     assert searched == [("matching", len(worth.pairs))]
     found = sum(len(o.observations) == 2 for o in made.objects)
