@@ -22,8 +22,10 @@ from more2_jax.matching.assignment import LogOdds, listed_at
 from more2_jax.matching.calibration import Compared, calibrated
 from more2_jax.matching.color import color_evidence
 from more2_jax.matching.metric_evidence import (
+    APART_M,
     MetricEvidence,
     Seen,
+    apart_within,
     metric_evidence,
     samples_of,
     seen_in,
@@ -229,6 +231,12 @@ def known_of(
         "top_gap_m": heights(old)[1][k] - heights(new)[1][i],
         "seen": seen,
     }
+
+
+def measured_among(aligned: AlignedPairs, noise_m: float) -> AlignedPairs:
+    """The same, compared as far as noise puts surfaces of two scans apart; at usual noise as it is."""
+    apart_m = apart_within(noise_m)
+    return aligned if apart_m == APART_M else measured_within(aligned, apart_m)
 
 
 def measured_within(aligned: AlignedPairs, apart_m: float) -> AlignedPairs:

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import jaxlie
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from more2_jax.geometry.free_space import padded_sights
 from more2_jax.geometry.padding import MAX_POINTS, bucket, pad_clouds
@@ -31,9 +31,8 @@ class PairBatch:
     stayed: jaxlie.SE3 = quantity("pose")  # (*batch,): "it did not move", source's local frame to target's
     # (*batch, k): poses found before, which registration refines; None: it searches for its own.
     candidates: jaxlie.SE3 | None = quantity("pose", default=None)
-    # (*batch,): so near both scans show surfaces where the other has the object that nothing but a closer fit says that
-    # it moved, meters; 0: they do not; None: not known, as if none.
-    stands_within_m: Float[Array | np.ndarray, "*batch"] | None = quantity("length", default=None)
+    # (*batch,): known not to have moved, whatever fits closer; None: of none.
+    stands: Bool[Array | np.ndarray, "*batch"] | None = quantity("invariant", default=None)
     # Source and target as the search that found the candidates prepared them; None: registration does.
     prepared: tuple[AlignableObject, AlignableObject] | None = quantity("record", default=None)
 
@@ -158,7 +157,7 @@ def about(code: Embedding, origin: Float[Array | np.ndarray, "*b 3"] | None) -> 
 def take_pairs(pairs: PairBatch, rows: Sequence[int]) -> PairBatch:
     """The pairs in `rows`, in that order."""
     at = np.asarray(rows, int)
-    rest = {k: getattr(pairs, k) for k in ("stayed", "candidates", "stands_within_m", "prepared")}
+    rest = {k: getattr(pairs, k) for k in ("stayed", "candidates", "stands", "prepared")}
     chosen = jax.tree.map(lambda x: x[at], rest)
     return PairBatch(source=pairs.source.take(at), target=pairs.target.take(at), **chosen)
 

@@ -52,7 +52,7 @@ def register(
         check_embedding(prior, pairs.target.code, "register")
     if isinstance(method, SurfaceRegistration):
         return register_by_surfaces(prior, pairs.local(), method, motion)
-    pairs = dataclasses.replace(pairs.local(), prepared=None, stands_within_m=None)
+    pairs = dataclasses.replace(pairs.local(), prepared=None, stands=None)
     if isinstance(method, DescentRegistration):
         return chunked(partial(_by_descent, prior, method=method), PAIRS_A_CALL, pairs)
     return chunked(partial(_by_field, prior, method=method, motion=motion), PAIRS_A_CALL, pairs)

@@ -53,14 +53,11 @@ STAYED_RATIO, STAYED_OFFSET = 1.1, 0.01
 # A center that is shifted by less, a share of the radius, has not moved; a turn by less may be an error; what a turn in
 # place must fit better than no motion.
 IN_PLACE, NOT_TURNED_DEG, TURNED_RATIO, TURNED_OFFSET = 0.25, 15.0, 1.2, 0.01
-# Of what both scans show where it stood: how many times those of another pose its distances may be
-# (docs/developing/notebook/still_standing.md).
-STANDING_RATIO = 1.3
 FINE = 0.25  # share of the truncation: the nearer one by which refined poses are told apart
 TURNED_DEG = 15.0  # competing poses differ by more
 
-# "It did not move", and how near both scans show surfaces where the other has the object, 0 where they do not.
-Stayed = tuple[jaxlie.SE3, Float[Array | np.ndarray, "*batch"]]
+# "It did not move", and whether that is known, whatever fits closer.
+Stayed = tuple[jaxlie.SE3, Bool[Array | np.ndarray, "*batch"]]
 
 
 def register_by_surfaces(
@@ -73,8 +70,8 @@ def register_by_surfaces(
     candidates = pairs.candidates
     if candidates is None:
         candidates = search_poses(source, target, pairs.stayed, settings.search, motion).poses
-    standing = jnp.zeros(len(pairs)) if pairs.stands_within_m is None else pairs.stands_within_m
-    return refine_poses(prior, (source, target), candidates, (pairs.stayed, standing), settings, motion)
+    stands = jnp.zeros(len(pairs), bool) if pairs.stands is None else pairs.stands
+    return refine_poses(prior, (source, target), candidates, (pairs.stayed, stands), settings, motion)
 
 
 def refine_poses(
@@ -134,7 +131,7 @@ def refine_pair(
     doubt = prior_cost(prior, poses, costs, (source, target), settings)
     moved = motion_since(stayed, poses, masked_mean(s.sampled.points, s.sampled.mask))
     best, costs = decided(costs, doubt, moved, settings.try_stayed)
-    best = where_it_stands(best, held[1] / radius * settings.try_stayed, poses, (s, t))
+    best = jnp.where(held[1] & settings.try_stayed, len(misfits) - 1, best)
     T = jax.tree.map(lambda x: x[best], poses)
     T = aligned = polished(T, (source, target), misfits[best], settings, motion)
     if settings.try_stayed:  # what stayed is exactly where it was
@@ -255,27 +252,6 @@ def simplest(
     shift, turned = (x[best] for x in moved)
     same = (shift < IN_PLACE) & (turned <= jnp.deg2rad(NOT_TURNED_DEG))
     return jnp.where(same & (simply(costs[-1]) <= costs[best]), len(costs) - 1, best)
-
-
-def where_it_stands(
-    best: Array,
-    within: Float[Array | np.ndarray, ""],
-    poses: jaxlie.SE3,
-    surfaces: tuple[Surface, Surface],
-) -> Array:
-    """The chosen pose, or "it did not move" (the last) if both scans show surfaces there, and it is nearly as near.
-
-    `within`: so near they show them, which truncates distances; 0 where they do not. It is no share of the radius:
-    noise and drift do not shrink with the object, and what fits a small thing closest may be no more than how noise
-    lies in either scan.
-    """
-
-    def kept(best: Array) -> Array:
-        two = jax.tree.map(lambda x: jnp.stack([x[-1], x[best]]), poses)
-        here, there = jax.vmap(lambda T: misfit(T, *surfaces, (jnp.asarray(within),)))(two)
-        return jnp.where(here <= STANDING_RATIO * there, len(poses.wxyz_xyz) - 1, best)
-
-    return jax.lax.cond(within > 0, kept, lambda best: best, best)
 
 
 def simply(cost: Float[Array, ""]) -> Float[Array, ""]:

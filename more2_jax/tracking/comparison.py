@@ -14,7 +14,7 @@ from more2_jax.config import EvidenceMatcher, SceneConfig
 from more2_jax.geometry.poses import Points, Pose, apply_pose
 from more2_jax.matching.assignment import NEVER
 from more2_jax.matching.calibration import even_odds
-from more2_jax.matching.candidates import AlignedPairs, align_proposed, evidence_at, odds_of
+from more2_jax.matching.candidates import AlignedPairs, align_proposed, evidence_at, measured_among, odds_of
 from more2_jax.matching.proposals import Proposed, proposed
 from more2_jax.network.prior import Prior
 from more2_jax.tracking.identify import Identified
@@ -143,6 +143,9 @@ class Comparison:
     def align_others(
         self, clouds: tuple[Sequence[ObservedObject], Sequence[ObservedObject]], worth: Proposed
     ) -> AlignedPairs:
-        """Pairs of such clouds, aligned."""
-        T, seen = self.identified.frame.T_scene_scan, self.aligned.seen
-        return align_proposed(self.prior, clouds, worth, self.matcher, self.config.motion, T, seen)
+        """Pairs of such clouds, aligned; compared as far as noise puts surfaces apart."""
+        frame, seen = self.identified.frame, self.aligned.seen
+        aligned = align_proposed(
+            self.prior, clouds, worth, self.matcher, self.config.motion, frame.T_scene_scan, seen
+        )
+        return measured_among(aligned, frame.noise_m)

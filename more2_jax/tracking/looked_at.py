@@ -122,14 +122,26 @@ def shares_still_there(
     near_m: float,
     but: Sequence[Collection[int]] | None = None,
 ) -> list[float]:
-    """Shares of places that lie on surfaces of a scan other than floor and walls; the first cloud is its background.
+    """Shares of places that lie on surfaces of a scan; the rest as for `distances_to_shown`."""
+    return [
+        float(np.isfinite(distance).mean()) for distance in distances_to_shown(places, clouds, near_m, but)
+    ]
 
-    Of the other clouds, one after the other, only what lies about the places is held. `but`: of each place, the numbers
-    of the clouds, background aside, that do not count.
+
+def distances_to_shown(
+    places: Sequence[Points],
+    clouds: Iterator[Points],
+    reach_m: float,
+    but: Sequence[Collection[int]] | None = None,
+) -> list[Float[np.ndarray, " _"]]:
+    """How far every point of places is from surfaces of a scan other than floor and walls, infinite beyond `reach_m`.
+
+    The first cloud is the scan's background. Of the other clouds, one after the other, only what lies about the places
+    is held. `but`: of each place, the numbers of the clouds, background aside, that do not count.
     """
     background = NearPoints(next(clouds))
     first, last = (np.array([f(p, axis=0) for p in places]).reshape(-1, 3) for f in (np.min, np.max))
-    first, last = first - near_m, last + near_m
+    first, last = first - reach_m, last + reach_m
     but = [()] * len(places) if but is None else but
     beside: list[list[Points]] = [[np.zeros((0, 3))] for _ in places]
     for n, cloud in ((n, c) for n, c in enumerate(clouds) if len(c)):
@@ -138,12 +150,11 @@ def shares_still_there(
             if n not in but[at]:
                 inside = (cloud >= first[at]) & (cloud <= last[at])
                 beside[at].append(cloud[inside.all(axis=1)])
-    shares = list[float]()
+    distances = list[Float[np.ndarray, " n"]]()
     for place, parts in zip(places, beside, strict=True):
         surfaces = around(place, background, np.concatenate(parts), background)
-        distance, _ = KDTree(surfaces).query(place, distance_upper_bound=near_m)
-        shares.append(float(np.isfinite(distance).mean()))
-    return shares
+        distances.append(KDTree(surfaces).query(place, distance_upper_bound=reach_m)[0])
+    return distances
 
 
 def spacing_of(background: Points) -> float:

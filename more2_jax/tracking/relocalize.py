@@ -29,7 +29,7 @@ from more2_jax.tracking.objects import (
 )
 from more2_jax.tracking.rooms import Rooms
 from more2_jax.tracking.scan_frame import settled_frame
-from more2_jax.tracking.scan_noise import near_m, with_noise
+from more2_jax.tracking.scan_noise import with_noise
 from more2_jax.tracking.still_standing import apart, standing
 from more2_jax.types import Frame, Instance, Observation, ObservedObject, Registration, SceneObject, Sight
 
@@ -158,7 +158,7 @@ def standing_in_place(
         and not apart(known[f.object], apply_pose(frame.T_scene_scan, shown[f.instance]))
     ]
     pairs = [(found[n].object, found[n].instance) for n in rows]
-    return np.array(rows, int)[standing(known, shown, pairs, frame, rooms)]
+    return np.array(rows, int)[standing(known, shown, pairs, T_scene_scan[rows], frame, rooms)]
 
 
 def registered(
@@ -168,13 +168,13 @@ def registered(
     config: SceneConfig,
     frame: Frame,
     *,
-    stands_within_m: float | None = None,
+    stands: bool = False,
 ) -> Registered:
     """All that was found registered, `frame` being the scan's; and the poses of instances in the scene's frame.
 
     Last the same poses aligned, where "it did not move" was taken as it is: else each would only confirm the frame.
     In batches of as many pairs as `config.memory_mb` holds. `sides`: objects and instances, some with what sensors saw
-    of them. `stands_within_m`: how near both scans show all of them where they stood, if they are `standing`.
+    of them. `stands`: whether all are `standing`.
     """
     found, parts = identified.found, list[Registered]()
     at_once = min(PAIRS_AT_ONCE, max(1, config.memory_mb // PAIR_MB))
@@ -183,8 +183,8 @@ def registered(
         pairs = pairs_found(identified, *sides(some), some)
         if frame is not identified.frame:
             pairs = with_frame(pairs, frame.T_scene_scan)
-        if stands_within_m is not None:
-            pairs = dataclasses.replace(pairs, stands_within_m=np.full(len(pairs), stands_within_m))
+        if stands:
+            pairs = dataclasses.replace(pairs, stands=np.ones(len(pairs), bool))
         result = jax.device_get(register(prior, pairs, config.registration, config.motion))
         T, aligned = result.T_target_source, result.aligned
         parts.append((result, pairs.to_world(T), pairs.to_world(T if aligned is None else aligned)))
@@ -204,7 +204,7 @@ def held_in_rows(
     if not len(rows):
         return placed
     some = dataclasses.replace(identified, found=tuple(identified.found[n] for n in rows))
-    others = registered(prior, some, sides, config, frame, stands_within_m=near_m(frame.noise_m))
+    others = registered(prior, some, sides, config, frame, stands=True)
 
     def put(x: np.ndarray, y: np.ndarray) -> np.ndarray:
         x = np.array(x)

@@ -12,8 +12,7 @@ import numpy as np
 
 from more2_jax.config import EvidenceMatcher, MotionModel
 from more2_jax.geometry.poses import Points, Pose, apply_pose, vertical_shift
-from more2_jax.matching.candidates import align_candidates, measured_within, odds_of
-from more2_jax.matching.metric_evidence import APART_M, apart_within
+from more2_jax.matching.candidates import align_candidates, measured_among, odds_of
 from more2_jax.matching.places import with_neighbors
 from more2_jax.matching.proposals import is_building, signatures
 from more2_jax.network.prior import Prior
@@ -103,9 +102,9 @@ def beside_one_another(
 
 def among_noise(weighed: Weighed, noise_m: float, matcher: EvidenceMatcher, motion: MotionModel) -> Weighed:
     """The same with clouds compared as far as noise puts surfaces apart, where scans have more of it than usual."""
-    if (apart_m := apart_within(noise_m)) == APART_M:
+    aligned = measured_among(weighed.aligned, noise_m)
+    if aligned is weighed.aligned:
         return weighed
-    aligned = measured_within(weighed.aligned, apart_m)
     odds = odds_of(aligned, matcher.search, motion, weighed.height_m)
     return Weighed(height_m=weighed.height_m, aligned=aligned, odds=odds)
 

@@ -11,12 +11,13 @@ from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 from jaxtyping import Bool, Float
+from scipy.spatial import KDTree
 
 from more2_jax.geometry.poses import Points, Pose, apply_pose
 from more2_jax.matching.assignment import Chosen
 from more2_jax.matching.candidates import AlignedPairs
 from more2_jax.matching.places import OTHER_COLOR, few, stayed
-from more2_jax.tracking.looked_at import shares_still_there, spacing_of
+from more2_jax.tracking.looked_at import distances_to_shown, shares_still_there, spacing_of
 from more2_jax.tracking.rooms import LEAST_BACKGROUND, Rooms
 from more2_jax.tracking.scan_noise import near_m
 from more2_jax.types import Frame
@@ -27,6 +28,9 @@ STANDS, SURELY_STANDS = 3.5, 8.0
 # Shares of a cloud's points that then lie on the other scan: half may lie on what was put there since; what was turned
 # by 6 degrees or shifted by 5 cm shows less than the second in its old place.
 LEAST_STANDING, SURELY_STANDING = 0.75, 0.85
+# How many times as far surfaces may be from what stands in its place as object and instance from one another at another
+# pose, where both stand, and where one does.
+BOTH_STAND, ONE_STANDS = 1.3, 1.0
 POINTS = 1000  # of a cloud, or somewhat more, that tell whether it stands there
 
 
@@ -73,28 +77,53 @@ def standing(
     known: Sequence[Points],
     new: Sequence[Points],
     pairs: Sequence[tuple[int, int]],
+    T_scene_new: Float[np.ndarray, "q 4 4"],
     frame: Frame,
     rooms: Rooms,
 ) -> Bool[np.ndarray, " q"]:
-    """Of pairs (object, instance), whether both scans show surfaces, of whatever, where the other has it.
+    """Of pairs (object, instance) that registration moved, which did not move by what either scan shows there.
 
-    `known`: clouds of objects (scene's frame); `new`: of instances (scan's frame). None is in a scan of unknown frame.
+    Where something stays, each scan shows surfaces, of whatever mask, where the other has it. They are about as near as
+    object and instance are to one another at the registered pose, `T_scene_new`. Of a mask that holds more than the
+    object, or less, one cloud alone may stand. `known`: clouds of objects (scene's frame); `new`: of instances
+    (scan's frame). None stands in a scan of unknown frame.
     """
     T = frame.T_scene_scan
     if frame.unknown or not pairs:
         return np.zeros(len(pairs), bool)
-    objects = [few(known[k], POINTS) for k, _ in pairs]
-    instances = [apply_pose(T, few(new[i], POINTS)) for _, i in pairs]
-    scan, before, near = (
-        shown(rooms.scan, new, T),
-        shown(rooms.scene, known, np.eye(4)),
-        near_m(frame.noise_m),
+    near = near_m(frame.noise_m)
+    reach = near, max(near, remembered_spacing(rooms))
+    objects, instances = (
+        [few(side[n], POINTS) for n in rows]
+        for side, rows in zip((known, new), zip(*pairs, strict=True), strict=True)
     )
-    shares = (
-        shares_still_there(objects, scan, near),
-        shares_still_there(instances, before, max(near, remembered_spacing(rooms))),
+    at_rest = (
+        distances_to_shown(objects, shown(rooms.scan, new, T), reach[0]),
+        distances_to_shown(
+            [apply_pose(T, p) for p in instances], shown(rooms.scene, known, np.eye(4)), reach[1]
+        ),
     )
-    return np.min(shares, axis=0) >= SURELY_STANDING
+    each = list(zip(pairs, T_scene_new, objects, instances, strict=True))
+    moved = (
+        [distances(p, apply_pose(T_k, new[i]), reach[0]) for (_, i), T_k, p, _ in each],
+        [distances(apply_pose(T_k, p), known[k], reach[1]) for (k, _), T_k, _, p in each],
+    )
+    shares = np.array([[np.isfinite(d).mean() for d in side] for side in at_rest])
+    farther = np.choose((shares >= SURELY_STANDING).sum(axis=0), [0.0, ONE_STANDS, BOTH_STAND])
+    return mean_distances(at_rest, reach) <= farther * mean_distances(moved, reach)
+
+
+def distances(points: Points, cloud: Points, reach_m: float) -> Float[np.ndarray, " n"]:
+    """Of points to the nearest of a cloud, infinite beyond `reach_m`."""
+    return KDTree(cloud).query(points, distance_upper_bound=reach_m)[0]
+
+
+def mean_distances(
+    sides: tuple[Sequence[Float[np.ndarray, " _"]], ...], reach_m: tuple[float, float]
+) -> Float[np.ndarray, " q"]:
+    """Of pairs, how far either cloud lies off, both ways together; what is beyond reach lies as far as that."""
+    means = [[np.minimum(d, r).mean() for d in side] for side, r in zip(sides, reach_m, strict=True)]
+    return np.sum(means, axis=0)
 
 
 def remembered_spacing(rooms: Rooms) -> float:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial import KDTree
 
-from more2_jax.config import EvidenceMatcher, SurfaceSearch
+from more2_jax.config import EvidenceMatcher, SurfaceSearch, preset
 from more2_jax.geometry.poses import apply_pose
 from more2_jax.matching.calibration import UPRIGHT
 from more2_jax.matching.candidates import align_candidates, evidence_at, measured_within, odds_of
@@ -23,9 +23,11 @@ from more2_jax.matching.metric_evidence import (
 from more2_jax.network.embedding_batch import embed
 from more2_jax.registration.pair_batch import local_batch
 from more2_jax.registration.search import alignable
+from more2_jax.tracking.comparison import Comparison
+from more2_jax.tracking.identify import Identified
 from more2_jax.tracking.scan_frame import among_noise
 from more2_jax.tracking.scan_height import Weighed
-from more2_jax.types import ObservedObject
+from more2_jax.types import Frame, ObservedObject
 
 SEARCH = SurfaceSearch(points=64, dense=128, cells=8, turns=4, steps=2)
 UP = np.array([[0.0, -1, 0, 0.3], [1, 0, 0, 0.2], [0, 0, 1, 0.05], [0, 0, 0, 1]])
@@ -192,3 +194,17 @@ def test_among_noise_pairs_are_compared_anew_at_the_same_poses(tiny_prior, scans
     gain = wider.odds.value - weighed.odds.value
     assert (gain[alike] > 0.5).all()  # noise speaks less against what is one object
     assert wider.odds.value[alike].min() > wider.odds.value[~np.array(alike)].max()
+
+
+def test_clouds_that_are_compared_later_are_compared_among_the_same_noise(tiny_prior, scans):
+    old, new = scans
+    config = dataclasses.replace(preset("robust", upright=True), matching=EvidenceMatcher(search=SEARCH))
+    pairs = align_candidates(tiny_prior, old, new, config.matching, "upright")
+    odds = list[dict[tuple[int, int], float]]()
+    for noise_m in (0.0, 0.01, 0.03):
+        known = Identified(frame=Frame(noise_m=noise_m), aligned=pairs)
+        compared = Comparison.of(tiny_prior, old, new, known, config)
+        assert compared is not None
+        odds.append(compared.odds_of_others(old, new))
+    assert odds[0] == odds[1] and odds[0].keys() == odds[2].keys()
+    assert all(odds[2][pair] > odds[0][pair] for pair in [(0, 0), (1, 1)])

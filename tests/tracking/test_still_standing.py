@@ -4,12 +4,14 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from more2_jax.geometry.poses import apply_pose
 from more2_jax.matching.candidates import AlignedPairs
 from more2_jax.tracking.rooms import Rooms
 from more2_jax.tracking.still_standing import STANDS, SURELY_STANDS, lost_by_standing, standing
 from more2_jax.types import Frame
+from tests.support import pieces
 
 FLOOR = np.random.default_rng(0).uniform([-1, -1, 0], [6, 6, 0], (20_000, 3))
 PAIR = np.array([[0, 0]])
@@ -156,34 +158,69 @@ def test_every_pair_is_told_as_if_it_were_alone():
     assert [lost(old, new, pairs=pairs[k : k + 1]) for k in (0, 1)] == [[SURELY_STANDS], [SURELY_STANDS]]
 
 
-def held(old, new, scene=FLOOR, scan=FLOOR, frame=None, pairs=((0, 0),)):
-    """Which pairs are `standing`; clouds as `lost` takes them."""
+def held(old, new, scene=FLOOR, scan=FLOOR, frame=None, pairs=((0, 0),), told=None):
+    """Which pairs are `standing`; clouds as `lost` takes them.
+
+    `told`: poses by registration, of instances to where they are said to have stood; by default as if far off.
+    """
     frame = frame or Frame(T_scene_scan=np.eye(4))
     back = np.linalg.inv(frame.T_scene_scan)
     rooms = Rooms(scene=scene, scan=apply_pose(back, scan))
-    return standing(old, [apply_pose(back, c) for c in new], list(pairs), frame, rooms).tolist()
+    there = FAR_OFF if told is None else told
+    poses = np.array([there @ frame.T_scene_scan for _ in pairs]).reshape(-1, 4, 4)
+    return standing(old, [apply_pose(back, c) for c in new], list(pairs), poses, frame, rooms).tolist()
+
+
+FAR_OFF = pieces.pose(Rotation.identity(), [9.0, 0.0, 0.0])
+TALL, LOW = (0.8, 0.6, 1.5), np.array([0.0, 0.0, 0.3])  # off the floor, of which what is close may be
+
+
+def tall(seed, shift=(0.0, 0.0, 0.0), noise_m=0.0, count=9000):
+    """A box that stands 30 cm off the floor."""
+    points = box(seed, HERE, TALL, count) + LOW + shift
+    return points + np.random.default_rng(seed).normal(0, noise_m, points.shape)
 
 
 def test_what_both_scans_show_in_one_place_stands_whatever_mask_it_has_there():
-    low = np.subtract(HERE, [0.0, 0.0, 0.3])  # most of it far from the floor, of which what is close may be
-    object_, instance, rest = (box(k, low, (0.8, 0.6, 1.5), 9000) + [0, 0, 0.3] for k in range(3))
+    object_, instance, rest = map(tall, range(3))
     assert held([object_], [instance]) == [True]
     # Of a mask in two each half stands where the whole does.
     left, right = (instance[keep] for keep in (instance[:, 0] < 1.3, instance[:, 0] >= 1.3))
     assert held([object_], [left, right], pairs=((0, 0), (0, 1))) == [True, True]
     assert held([object_], [left], scan=np.concatenate([FLOOR, rest])) == [True]
-    assert held([object_], [left]) == [False]
 
 
-@pytest.mark.parametrize("shift_m", [0.08, 0.3, 3.0])
+@pytest.mark.parametrize("other", ["object", "instance"])
+def test_of_a_mask_that_holds_more_than_the_object_one_cloud_stands(other):
+    """Half of the larger cloud is of what only one scan shows; it lies nowhere else any better."""
+    small, large = tall(0), np.concatenate([tall(1), box(2, [1.0, 1.65, 0.3], TALL, 9000)])
+    assert held(*([small], [large]) if other == "instance" else ([large], [small])) == [True]
+
+
+@pytest.mark.parametrize("shift_m", [0.08, 0.3])
 def test_what_moved_does_not_stand(shift_m):
-    assert held([box(0, HERE)], [box(1, np.add(HERE, [shift_m, 0.0, 0.0]))]) == [False]
+    shift = np.array([shift_m, 0.0, 0.0])
+    true = pieces.pose(Rotation.identity(), -shift)
+    assert held([tall(0)], [tall(1, shift)], told=true) == [False]
+
+
+def test_where_neither_cloud_lies_on_the_other_scan_nothing_stands():
+    assert held([box(0, HERE)], [box(1, THERE)]) == [False]
+
+
+@pytest.mark.parametrize(("noise_m", "stands"), [(0.01, True), (0.0, False)])
+def test_another_pose_has_to_be_nearer_by_more_than_noise(noise_m, stands):
+    """Slid by 1.5 cm, it lies within 3 cm of where it stood all over."""
+    shift = np.array([0.015, 0.0, 0.0])
+    true = pieces.pose(Rotation.identity(), -shift)
+    clouds = [tall(0, noise_m=noise_m, count=50_000)], [tall(1, shift, noise_m, 50_000)]
+    assert held(*clouds, told=true) == [stands]
 
 
 @pytest.mark.parametrize(("noise_m", "stands"), [(0.0, False), (0.012, False), (0.03, True)])
 def test_among_noise_what_lies_farther_off_stands_as_well(noise_m, stands):
-    clouds, frame = ([box(0, HERE)], [box(1, np.add(HERE, 0.05))]), Frame(noise_m=noise_m)
-    assert held(*clouds, frame=frame) == [stands]
+    frame = Frame(noise_m=noise_m)
+    assert held([box(0, HERE)], [box(1, np.add(HERE, 0.05))], frame=frame) == [stands]
     gone = [box(0, HERE)], [box(1, THERE), box(2, np.add(HERE, 0.05))]
     assert lost(*gone, frame=frame) == ([SURELY_STANDS] if stands else [0.0])
 
@@ -191,7 +228,7 @@ def test_among_noise_what_lies_farther_off_stands_as_well(noise_m, stands):
 def test_nothing_stands_in_a_scan_of_unknown_frame_and_of_no_pairs_there_is_none():
     c, s = np.cos(0.7), np.sin(0.7)
     T = np.array([[c, -s, 0, 2.0], [s, c, 0, -1.0], [0, 0, 1, 0.1], [0, 0, 0, 1]])
-    clouds = [box(0, HERE)], [box(1, HERE)]
+    clouds = [tall(0)], [tall(1)]
     assert held(*clouds, frame=Frame(T_scene_scan=T)) == [True]
     assert held(*clouds, frame=Frame(T_scene_scan=T, unknown=True)) == [False]
     assert held(*clouds, pairs=()) == []
