@@ -11,18 +11,15 @@ from more2_jax.matching.candidates import AlignedPairs
 from more2_jax.tracking.rooms import Rooms
 from more2_jax.tracking.still_standing import STANDS, SURELY_STANDS, lost_by_standing, standing
 from more2_jax.types import Frame
-from tests.support import pieces
+from tests.support import boxes, pieces
 
 FLOOR = np.random.default_rng(0).uniform([-1, -1, 0], [6, 6, 0], (20_000, 3))
 PAIR = np.array([[0, 0]])
 
 
 def box(seed, corner, size=(0.8, 0.6, 0.7), count=3000):
-    """The surface of a box."""
-    rng = np.random.default_rng(seed)
-    points = rng.uniform(size=(count, 3))
-    points[np.arange(count), rng.integers(0, 3, count)] = rng.integers(0, 2, count)
-    return points * size + corner
+    """The surface of a box, by its lowest corner."""
+    return boxes.box(seed, size, np.add(corner, np.divide(size, 2)), count)
 
 
 HERE, THERE = [1.0, 1.0, 0.0], [4.0, 3.5, 0.0]
