@@ -2,7 +2,8 @@
 
 `python -m eval.matching --data data/flying_sparse --out runs/matching --scenes 10`
 
-Pairs of the first scan with every later one, as the paper has them.
+Pairs of the first scan with every later one, as the paper has them. Of upright things scans are leveled by their floors
+first, for all methods; masks stay as they are.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from typing import Annotated
 import numpy as np
 import tyro
 
+from eval.data.tilted import leveled_scans
 from eval.data.truth import KnownScene
 from eval.harness.batched import embed_all
 from eval.harness.options import OptionsBeside, benchmark, is_upright
@@ -84,7 +86,12 @@ def prepare(options: Settings) -> tuple[Run, Work]:
     peers |= learned_matchers(options.learned)
     current = open_run("matching", options, {"methods": [*methods, *peers], **stated(options.learned)})
     settings = {n: replace(preset(options.preset, upright=upright), matching=m) for n, m in methods.items()}
-    return current, lambda scenes: work(scenes, current.prior, settings, peers, options.batch)
+
+    def leveled_work(scenes: Sequence[KnownScene]) -> list[list[Record]]:
+        scenes = [leveled_scans(s) for s in scenes] if upright else scenes
+        return work(scenes, current.prior, settings, peers, options.batch)
+
+    return current, leveled_work
 
 
 def own_settings(*names: str) -> dict[str, CodeMatcher | EvidenceMatcher]:

@@ -1,6 +1,8 @@
 """Where matched objects went: rotation errors, recalls and distances over true pairs (paper §3.3 and §4).
 
 `python -m eval.registration --data data/flying_sparse --out runs/registration --scenes 10`
+
+Of upright things scans are leveled by their floors first, for all methods; masks stay as they are.
 """
 
 from __future__ import annotations
@@ -15,6 +17,7 @@ import numpy as np
 import tyro
 
 from eval.data.masks import LOST
+from eval.data.tilted import leveled_scans
 from eval.data.truth import KnownObject, KnownScene
 from eval.harness.batched import PairToRegister, embed_all, register_all
 from eval.harness.closed_pairs import closed_poses
@@ -132,7 +135,8 @@ def prepare(options: Settings) -> tuple[Run, Work]:
     current = open_run("registration", options, facts)
 
     def work(scenes: Sequence[KnownScene]) -> list[list[Record]]:
-        pairs = [p for s in scenes for p in true_pairs(s, options.pairs)]
+        level = [leveled_scans(s) for s in scenes] if upright else scenes
+        pairs = [p for s in level for p in true_pairs(s, options.pairs)]
         records: list[tuple[str, Record]] = []
         for name, settings in ours.items():
             scene = preset(name, upright=upright)

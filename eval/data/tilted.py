@@ -1,7 +1,8 @@
-"""Scans tilted by exactly so much against gravity, each another way, whatever they were before."""
+"""Scans tilted by exactly so much against gravity, each another way, whatever they were before; and leveled ones."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -10,7 +11,8 @@ from scipy.spatial.transform import Rotation
 from eval.data.truth import KnownScene
 from more2_jax.geometry.gravity import least_turn
 from more2_jax.geometry.poses import Pose, apply_pose
-from more2_jax.tracking.leveling import leveled
+from more2_jax.tracking.leveling import is_level, level_of, leveled
+from more2_jax.tracking.room_points import remembered
 
 
 def tilted(scene: KnownScene, tilt_deg: float, seed: int = 0) -> KnownScene:
@@ -20,6 +22,20 @@ def tilted(scene: KnownScene, tilt_deg: float, seed: int = 0) -> KnownScene:
     """
     rng = np.random.default_rng((seed, *scene.name.encode()))
     turns = [_tilt(scene, k, tilt_deg, rng.uniform(0, 2 * np.pi)) for k in range(len(scene.scans))]
+    return turned_scans(scene, turns)
+
+
+def leveled_scans(scene: KnownScene) -> KnownScene:
+    """The scene, every scan leveled by its floors as the method levels those of a living scene."""
+    first = level_of(remembered(scene.scans[0].background))
+    later = (level_of(remembered(s.background), first) for s in scene.scans[1:])
+    return turned_scans(scene, [first, *later])
+
+
+def turned_scans(scene: KnownScene, turns: Sequence[Pose]) -> KnownScene:
+    """The scene, every scan and what is true of it moved by a pose."""
+    if all(map(is_level, turns)):
+        return scene
     objects = [
         replace(o, T_scan_model={k: turns[k] @ T for k, T in o.T_scan_model.items()}) for o in scene.objects
     ]

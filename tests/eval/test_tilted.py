@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from known_scenes import known_scene, pose
 
-from eval.data.tilted import tilted
+from eval.data.tilted import leveled_scans, tilted
 from eval.scores.tracks import Track, score_tracks
+from more2_jax.geometry.poses import apply_pose
 
 SCENE = known_scene(copies=("a", "b", "c"), scans=2)
 
@@ -69,3 +70,33 @@ def test_things_in_any_orientation_have_no_tilt():
     scene = dataclasses.replace(SCENE, objects=(SCENE.objects[0], fallen, SCENE.objects[2]))
     with pytest.raises(ValueError, match="no common up of its objects; needed upright rooms"):
         tilted(scene, 5.0)
+
+
+def on_floor(scene):
+    """The scene with a floor below and a wall beside it, as background of every scan."""
+    rng = np.random.default_rng(0)
+    floor = rng.uniform([-2, -2, -0.75], [10, 6, -0.75], (30_000, 3))
+    wall = rng.uniform([-2, 6, -0.75], [10, 6, 1.8], (10_000, 3))
+    background = np.concatenate([floor, wall])
+    return dataclasses.replace(
+        scene, scans=tuple(dataclasses.replace(s, background=background) for s in scene.scans)
+    )
+
+
+def test_scans_are_leveled_by_their_floors_and_the_truth_with_them():
+    level = on_floor(SCENE)
+    found = leveled_scans(tilted(level, 5.0))
+    for k in range(2):
+        assert np.linalg.norm(up_of(found, k)[:2]) < np.sin(np.deg2rad(0.5))
+        for o, old in zip(found.objects, level.objects, strict=True):
+            model = [
+                apply_pose(np.linalg.inv(x.T_scan_model[k]), s.instance(k, x.instance[k]).points)
+                for s, x in ((found, o), (level, old))
+            ]
+            np.testing.assert_allclose(*model, atol=1e-9)
+
+
+def test_what_is_level_or_shows_no_floor_stays_as_it_is():
+    assert leveled_scans(on_floor(SCENE)).scans[0].instances == on_floor(SCENE).scans[0].instances
+    bare = tilted(SCENE, 5.0)
+    assert leveled_scans(bare) is bare
