@@ -170,6 +170,7 @@ def added(
     stage = partial(staged, timing, progress, scan=scan.name)
     whole, old, new, identified = who_is_who(prior, scene, cleared.instances, level, config, stage)
     found = identified.found
+    give_back(len(found))  # what matching took
     with stage("register", len(found)):
         views = Views(whole.objects, scene.scans, whole.instances, level, remembered(level.background))
         seen, frame = relocalize(prior, views, old, new, identified, index, config, rooms_of(scene, level))

@@ -157,8 +157,12 @@ def standing_in_place(
         if not np.allclose(T_scene_scan[n], frame.T_scene_scan, atol=SAME)
         and not apart(known[f.object], apply_pose(frame.T_scene_scan, shown[f.instance]))
     ]
-    pairs = [(found[n].object, found[n].instance) for n in rows]
-    return np.array(rows, int)[standing(known, shown, pairs, T_scene_scan[rows], frame, rooms)]
+    stand = [np.zeros(0, bool)]
+    for start in range(0, len(rows), PAIRS_AT_ONCE):  # what lies about every pair is held at once
+        some = rows[start : start + PAIRS_AT_ONCE]
+        pairs = [(found[n].object, found[n].instance) for n in some]
+        stand.append(standing(known, shown, pairs, T_scene_scan[some], frame, rooms))
+    return np.array(rows, int)[np.concatenate(stand)]
 
 
 def registered(

@@ -15,7 +15,7 @@ from more2_jax.registration import search, surface
 from more2_jax.scene import add_scan, compared_objects, start_scene
 from more2_jax.tracking import relocalize
 from more2_jax.tracking.identify import identify
-from more2_jax.types import Frame
+from more2_jax.types import Embedding, Frame, ObservedObject
 
 pytestmark = [pytest.mark.optimized, pytest.mark.no_cover]
 
@@ -164,3 +164,25 @@ def test_a_cloud_is_prepared_once_whatever_number_of_pairs_it_is_part_of(tiny_pr
     add_scan(tiny_prior, first, scan("b", THEN), CONFIG)
     most = len(first.objects) + len(THEN)  # clouds of both scans that are alike to the bit are one
     assert len(prepared) == len(set(prepared)) and max(len(first.objects), len(THEN)) <= len(prepared) <= most
+
+
+def test_pairs_that_may_stand_are_asked_about_some_at_a_time(monkeypatch):
+    asked = []
+
+    def standing(known, new, pairs, T, *_):
+        asked.append(len(pairs))
+        np.testing.assert_array_equal(T[:, 0, 3], [0.01 * (k + 1) for k, _ in pairs])
+        return np.array([k != 1 for k, _ in pairs])
+
+    monkeypatch.setattr(relocalize, "standing", standing)
+    monkeypatch.setattr(relocalize, "PAIRS_AT_ONCE", 2)
+    found = [relocalize.Found(object=k, instance=k, score=1.0) for k in range(4)]
+    T = np.array([np.eye(4)] * 4)
+    T[:, 0, 3] = [0.01, 0.02, 0.03, 0.0]  # the last is where nothing moved
+    code = object.__new__(Embedding)
+    corners = np.array([[-0.1] * 3, [0.1] * 3])
+    near = [ObservedObject(points=corners + k, embedding=code) for k in range(4)]
+    rows = relocalize.standing_in_place(near, near, found, T, Frame(), relocalize.NO_ROOMS, CONFIG)
+    assert rows.tolist() == [0, 2] and asked == [2, 1]
+    still = relocalize.standing_in_place(near, near, found, T[[3] * 4], Frame(), relocalize.NO_ROOMS, CONFIG)
+    assert still.tolist() == []
