@@ -169,9 +169,8 @@ def added(
     index, timing = len(scene.scans), dict(scene.timing_s)
     stage = partial(staged, timing, progress, scan=scan.name)
     whole, old, new, identified = who_is_who(prior, scene, cleared.instances, level, config, stage)
-    found = identified.found
-    give_back(len(found))  # what matching took
-    with stage("register", len(found)):
+    with stage("register", len(found := identified.found)):
+        give_back(len(found))  # what matching took
         views = Views(whole.objects, scene.scans, whole.instances, level, remembered(level.background))
         seen, frame = relocalize(prior, views, old, new, identified, index, config, rooms_of(scene, level))
     codes, identified, views, old, new = [o.embedding for o in new], identified.without_pairs(), None, (), ()
