@@ -84,7 +84,9 @@ def prepare(options: Settings) -> tuple[Run, Work]:
     if options.classifier is not None:
         peers |= {classifier.NAME: classifier.classifier(options.classifier, options.batch)}
     peers |= learned_matchers(options.learned)
-    current = open_run("matching", options, {"methods": [*methods, *peers], **stated(options.learned)})
+    current = open_run(
+        "matching", options, {"methods": [*methods, *peers], "leveled": upright, **stated(options.learned)}
+    )
     settings = {n: replace(preset(options.preset, upright=upright), matching=m) for n, m in methods.items()}
 
     def leveled_work(scenes: Sequence[KnownScene]) -> list[list[Record]]:

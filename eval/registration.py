@@ -131,7 +131,7 @@ def prepare(options: Settings) -> tuple[Run, Work]:
     ours = by_preset(options.presets, upright)
     peers = (registrars() if options.peers else {}) | learned_registrars(options.learned)
     methods = [*(m for settings in ours.values() for m in settings), *peers]
-    facts = {"methods": methods, "pairs": options.pairs, **stated(options.learned)}
+    facts = {"methods": methods, "pairs": options.pairs, "leveled": upright, **stated(options.learned)}
     current = open_run("registration", options, facts)
 
     def work(scenes: Sequence[KnownScene]) -> list[list[Record]]:

@@ -28,8 +28,8 @@ STANDS, SURELY_STANDS = 3.5, 8.0
 # Shares of a cloud's points that then lie on the other scan: half may lie on what was put there since; what was turned
 # by 6 degrees or shifted by 5 cm shows less than the second in its old place.
 LEAST_STANDING, SURELY_STANDING = 0.75, 0.85
-# How many times as far surfaces may be from what stands in its place as object and instance from one another at another
-# pose, where both stand, and where one does.
+# What the other scan shows in its place may be so many times as far off as object and instance are from one another at
+# another pose: where both clouds lie there, and where one does.
 BOTH_STAND, ONE_STANDS = 1.3, 1.0
 POINTS = 1000  # of a cloud, or somewhat more, that tell whether it stands there
 

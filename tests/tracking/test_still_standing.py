@@ -194,6 +194,14 @@ def test_of_a_mask_that_holds_more_than_the_object_one_cloud_stands(other):
     assert held(*([small], [large]) if other == "instance" else ([large], [small])) == [True]
 
 
+def test_of_one_cloud_that_lies_there_another_pose_has_to_be_nearer_only():
+    """Another thing was put where the object stood: its old place is full, and yet it lies elsewhere."""
+    shift = np.array([3.0, 0.0, 0.0])
+    clouds = [tall(0)], [tall(1, shift), tall(2)]
+    assert held(*clouds, told=pieces.pose(Rotation.identity(), -shift)) == [False]
+    assert held(*clouds) == [True]  # nowhere else is nearer
+
+
 @pytest.mark.parametrize("shift_m", [0.08, 0.3])
 def test_what_moved_does_not_stand(shift_m):
     shift = np.array([shift_m, 0.0, 0.0])
