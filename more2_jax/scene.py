@@ -118,6 +118,7 @@ def who_is_who(
 
     def mended_by(mend: Mend, known: Compared) -> Regrouped | None:
         masks, old, new, identified = known
+        give_back(len(new))
         compared = Comparison.of(prior, [o for o, _ in old], new, identified, config)
         return compared and mend(masks, compared)
 

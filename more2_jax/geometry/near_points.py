@@ -64,10 +64,22 @@ class NearPoints:
 
     def around_box(self, low: Float[np.ndarray, "3"], high: Float[np.ndarray, "3"]) -> Points:
         """The points of a box, and some beside it, in the order in which they were given."""
+        cells = self._cells_of_box(low, high)
+        given = [self._order[self._ends[c] : self._ends[c + 1]] for c in cells]
+        return (
+            self.points_of(np.array(cells))[np.argsort(np.concatenate(given))] if given else self._points[:0]
+        )
+
+    def rows_around_box(
+        self, low: Float[np.ndarray, "3"], high: Float[np.ndarray, "3"]
+    ) -> Int[np.ndarray, " m"]:
+        """The rows of those points among the given ones, ascending."""
+        given = [self._order[self._ends[c] : self._ends[c + 1]] for c in self._cells_of_box(low, high)]
+        return np.sort(np.concatenate(given)) if given else self._order[:0]
+
+    def _cells_of_box(self, low: Float[np.ndarray, "3"], high: Float[np.ndarray, "3"]) -> list[int]:
         apart = np.abs(self._center - (low + high) / 2) - (high - low) / 2
-        cells = np.flatnonzero((apart <= CELL_M / 2 + TOUCHING_M).all(axis=1))
-        given = [self._order[self._ends[c] : self._ends[c + 1]] for c in cells.tolist()]
-        return self.points_of(cells)[np.argsort(np.concatenate(given))] if given else self._points[:0]
+        return np.flatnonzero((apart <= CELL_M / 2 + TOUCHING_M).all(axis=1)).tolist()
 
 
 class NearClouds:

@@ -1,7 +1,7 @@
 """A new scan against the objects known so far: its frame, who is who in it, and what each object gains.
 
 Turns scene records into observed and accumulated objects, and what the stages answer into records.
-May import `matching`, `registration`, `network`, `geometry`, `config`, `types`.
+May import `matching`, `registration`, `network`, `geometry`, `config`, `types`, `freed_memory`.
 """
 
 from typing import TYPE_CHECKING

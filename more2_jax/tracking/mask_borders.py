@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.spatial import KDTree
 
+from more2_jax.freed_memory import give_back
 from more2_jax.geometry.near_points import NearClouds, NearPoints, ball_around
 from more2_jax.geometry.poses import Points, apply_pose
 from more2_jax.geometry.room_planes import AROUND_M, BOX_SLACK, on_planes, room_planes, within
@@ -201,15 +202,18 @@ def regained(views: Sequence[View], loose: Points, background: Points) -> list[B
     `loose`: all points of the scan that are no object's. Floor and walls, sought in the `background`, stay there.
     """
     few = background[:: max(1, -(-len(background) // THINNED))]
+    surfaces, near = NearPoints(few), NearPoints(loose)  # of a building little lies about one object
     nearest, owner = np.full(len(loose), np.inf), np.full(len(loose), -1)
     for n, (v, room) in enumerate(zip(views, rooms_about(views, few), strict=True)):
         own, others = v.own, v.others
-        distance = off(loose, others, v.reach_m)
-        rows = np.flatnonzero(distance < nearest)
-        among = np.concatenate([own, within(KDTree(others), loose, v.reach_m + BESIDE_M)])
-        planes = room_planes(np.concatenate([own, others]), few, room) if len(rows) else []
-        rows = rows[~on_planes(loose[rows], planes, among)[0]]
-        nearest[rows], owner[rows] = distance[rows], n
+        rows = near.rows_around_box(others.min(axis=0) - v.reach_m, others.max(axis=0) + v.reach_m)
+        distance = off(loose[rows], others, v.reach_m)
+        closer = distance < nearest[rows]
+        rows, distance = rows[closer], distance[closer]
+        among = np.concatenate([own, within(KDTree(others), near, v.reach_m + BESIDE_M)])
+        planes = room_planes(np.concatenate([own, others]), surfaces, room) if len(rows) else []
+        free = ~on_planes(loose[rows], planes, among)[0]
+        nearest[rows[free]], owner[rows[free]] = distance[free], n
     return [
         Border(
             view=v,
@@ -226,6 +230,7 @@ def rooms_about(views: Sequence[View], background: Points) -> Iterator[NearPoint
     """For every view what its scan shows around: all masks near it and near those next in line, and the background."""
     clouds = NearClouds([partial(getattr, v, "own") for v in views], background)
     for start in range(0, len(views), TOGETHER):
+        give_back(len(views))
         balls = [ball_around(np.concatenate([v.own, v.others])) for v in views[start : start + TOGETHER]]
         reach_m = max(radius for _, radius in balls) + 2 * BOX_SLACK * AROUND_M
         yield from itertools.repeat(clouds.near([center for center, _ in balls], reach_m), len(balls))

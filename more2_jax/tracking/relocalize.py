@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from more2_jax.config import EvidenceMatcher, SceneConfig, SurfaceRegistration
+from more2_jax.freed_memory import give_back
 from more2_jax.geometry.poses import Points, Pose, apply_pose, local_poses
 from more2_jax.geometry.transform import transform
 from more2_jax.matching.places import share_on
@@ -192,6 +193,8 @@ def registered(
         result = jax.device_get(register(prior, pairs, config.registration, config.motion))
         T, aligned = result.T_target_source, result.aligned
         parts.append((result, pairs.to_world(T), pairs.to_world(T if aligned is None else aligned)))
+        del pairs  # what sensors saw of the next ones takes its place
+        give_back(len(found))
     return parts[0] if len(parts) == 1 else jax.tree.map(lambda *x: np.concatenate(x), *parts)
 
 

@@ -46,12 +46,14 @@ def test_around_a_box_all_of_it_comes_in_the_order_given_and_little_else(size):
         wanted = ((low <= POINTS) & (low + size >= POINTS)).all(axis=1)
         np.testing.assert_array_equal(found[kept], POINTS[wanted])
         assert ((found >= low - CELL_M) & (found <= low + size + CELL_M)).all()
+        np.testing.assert_array_equal(POINTS[near.rows_around_box(low, low + size)], found)
 
 
 def test_of_no_points_none_are_near():
     near = NearPoints(np.zeros((0, 3)))
     assert near.points_of(near.cells_around(np.zeros(3), 5.0)).shape == (0, 3)
     assert near.around_box(np.zeros(3), np.ones(3)).shape == (0, 3)
+    assert not len(near.rows_around_box(np.zeros(3), np.ones(3)))
 
 
 def test_clouds_near_some_places_show_there_what_all_clouds_show():

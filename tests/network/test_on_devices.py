@@ -7,6 +7,7 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
+from compiling import FLAGS
 from places import ROOT
 
 from more2_jax.network import on_devices
@@ -66,7 +67,7 @@ print("held")
 
 def test_four_devices_have_the_weights_once_and_share_calls():
     environment = os.environ | {
-        "XLA_FLAGS": "--xla_force_host_platform_device_count=4",
+        "XLA_FLAGS": f"--xla_force_host_platform_device_count=4 {FLAGS}",
         "JAX_PLATFORMS": "cpu",
         "PYTHONPATH": str(ROOT),
     }

@@ -8,6 +8,9 @@ from importlib.metadata import version
 import jax
 
 LITTLE, PRECISION = "jax_disable_most_optimizations", "jax_default_matmul_precision"  # options of JAX
+# XLA ends the process at flags that it does not know. The commands set this one, too: what they compile is found again
+# by the tests that are marked, and the other way round.
+FLAGS = "--xla_cpu_use_fusion_emitters=false" if version("jaxlib").startswith(("0.9.", "0.10.")) else ""
 
 
 def compile_quickly() -> None:
@@ -16,10 +19,7 @@ def compile_quickly() -> None:
     Such programs compile several times faster, run slower, and compute the same up to rounding. Processes that tests
     start compile as they do for users.
     """
-    # XLA ends the process at flags that it does not know. The commands set this one, too: what they compile is found
-    # again by the tests that are marked, and the other way round.
-    if version("jaxlib").startswith(("0.9.", "0.10.")):
-        os.environ["XLA_FLAGS"] = "--xla_cpu_use_fusion_emitters=false"
+    os.environ["XLA_FLAGS"] = FLAGS
     jax.config.update(LITTLE, True)
     jax.config.update(PRECISION, "highest")
 

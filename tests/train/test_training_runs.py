@@ -12,7 +12,7 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
-from compiling import LITTLE
+from compiling import FLAGS, LITTLE
 from places import ROOT
 from sphere_shards import sphere_shards
 
@@ -110,7 +110,7 @@ def program(arguments: list[str], devices: int = 1, quickly: bool = False) -> su
     environment = os.environ | {
         LITTLE.upper(): str(quickly),
         "JAX_PLATFORMS": "cpu",
-        "XLA_FLAGS": f"--xla_force_host_platform_device_count={devices}",
+        "XLA_FLAGS": f"--xla_force_host_platform_device_count={devices} {FLAGS}",
         "PYTHONPATH": str(ROOT),
     }
     pipe = subprocess.PIPE
