@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Bool
 from scipy.spatial import KDTree
 
-from more2_jax.geometry.near_points import NearPoints
+from more2_jax.geometry.near_points import CELL_M, NearPoints
 from more2_jax.geometry.poses import Points
 from more2_jax.geometry.room_planes import on_planes, room_planes, within
 from more2_jax.types import Instance, Repair, SceneObject
@@ -23,7 +23,9 @@ Rows = Bool[np.ndarray, " n"]
 
 MOST_DROPPED = 0.5  # share of a mask: what lies more in a wall or floor than off it is a picture, or a rug
 LEAST_DROPPED = 0.01  # share of a mask: fewer are no patch, and as likely its own
-BACKGROUND_POINTS = 20_000  # of a scan, kept for the page and for free space
+# Of a scan's background, kept for the page and for free space: so many, or of a building so many a cell of a meter.
+BACKGROUND_POINTS, POINTS_A_CELL = 20_000, 100
+COUNTED = 200_000  # points that tell how many cells there are
 BESIDE_M = 0.1  # of a mask: background that tells which way its points face
 
 
@@ -57,8 +59,16 @@ class Cleared:
 
 
 def remembered(background: Points) -> Points:
-    """Returns every k-th point of a scan's background, so that at most `BACKGROUND_POINTS` remain."""
-    return background[:: max(1, -(-len(background) // BACKGROUND_POINTS))]
+    """Returns every k-th point of a scan's background: `BACKGROUND_POINTS` at most, of a building more.
+
+    A room has some 150 cells of a meter that hold surfaces: floors and walls of every room are as dense as of one.
+    """
+    if len(background) <= BACKGROUND_POINTS:
+        return background
+    some = background[:: max(1, len(background) // COUNTED)]
+    cells = len(np.unique(np.floor(some / CELL_M).astype(np.int64), axis=0))
+    most = max(BACKGROUND_POINTS, POINTS_A_CELL * cells)
+    return background[:: max(1, -(-len(background) // most))]
 
 
 def without_room(instances: Sequence[Instance], background: Points, fewest: int) -> Cleared:
