@@ -64,7 +64,7 @@ class NearPoints:
 
     def around_box(self, low: Float[np.ndarray, "3"], high: Float[np.ndarray, "3"]) -> Points:
         """The points of a box, and some beside it, in the order in which they were given."""
-        cells = self._cells_of_box(low, high)
+        cells = self.cells_of_box(low, high)
         given = [self._order[self._ends[c] : self._ends[c + 1]] for c in cells]
         return (
             self.points_of(np.array(cells))[np.argsort(np.concatenate(given))] if given else self._points[:0]
@@ -74,10 +74,11 @@ class NearPoints:
         self, low: Float[np.ndarray, "3"], high: Float[np.ndarray, "3"]
     ) -> Int[np.ndarray, " m"]:
         """The rows of those points among the given ones, ascending."""
-        given = [self._order[self._ends[c] : self._ends[c + 1]] for c in self._cells_of_box(low, high)]
+        given = [self._order[self._ends[c] : self._ends[c + 1]] for c in self.cells_of_box(low, high)]
         return np.sort(np.concatenate(given)) if given else self._order[:0]
 
-    def _cells_of_box(self, low: Float[np.ndarray, "3"], high: Float[np.ndarray, "3"]) -> list[int]:
+    def cells_of_box(self, low: Float[np.ndarray, "3"], high: Float[np.ndarray, "3"]) -> list[int]:
+        """The cells that may hold points of a box."""
         apart = np.abs(self._center - (low + high) / 2) - (high - low) / 2
         return np.flatnonzero((apart <= CELL_M / 2 + TOUCHING_M).all(axis=1)).tolist()
 
@@ -89,23 +90,25 @@ class NearClouds:
     """
 
     def __init__(self, clouds: Sequence[Made], rest: Points) -> None:
-        """`rest`: points that belong to every place, such as the background."""
+        """`rest`: points of no cloud, such as the background."""
         balls = [ball_around(cloud()) for cloud in clouds]
-        self._clouds, self._rest = clouds, rest
+        self._clouds, self._rest = clouds, NearPoints(rest)
         self._center = np.reshape([center for center, _ in balls], (-1, 3))
         self._radius = np.array([radius for _, radius in balls])
-        self._last: tuple[tuple[int, ...], NearPoints] | None = None
+        self._last: tuple[tuple[list[int], list[int]], NearPoints] | None = None
 
     def near(self, places: Sequence[Float[np.ndarray, "3"]], reach_m: float) -> NearPoints:
         """All points in the cells within the reach of a place (`NearPoints.cells_around`), and some beside."""
-        reach = reach_m + 2 * RADIUS_M + self._radius + TOUCHING_M
+        reach = reach_m + 2 * RADIUS_M + TOUCHING_M
         near = np.zeros(len(self._clouds), bool)
         for place in places:
-            near |= np.linalg.norm(self._center - place, axis=1) <= reach
-        rows = tuple(np.flatnonzero(near).tolist())
-        if self._last is None or self._last[0] != rows:
+            near |= np.linalg.norm(self._center - place, axis=1) <= reach + self._radius
+        low, high = (np.reshape(f(places, axis=0), 3) if places else np.zeros(3) for f in (np.min, np.max))
+        key = np.flatnonzero(near).tolist(), self._rest.cells_of_box(low - reach, high + reach)
+        if self._last is None or self._last[0] != key:
             self._last = None  # let go before the next one is made
-            self._last = rows, NearPoints(np.concatenate([*(self._clouds[k]() for k in rows), self._rest]))
+            rest = self._rest.around_box(low - reach, high + reach)
+            self._last = key, NearPoints(np.concatenate([*(self._clouds[k]() for k in key[0]), rest]))
         return self._last[1]
 
 

@@ -22,6 +22,7 @@ from more2_jax.geometry.near_points import NearClouds, NearPoints, ball_around
 from more2_jax.geometry.poses import Points, apply_pose
 from more2_jax.geometry.room_planes import AROUND_M, BOX_SLACK, on_planes, room_planes, within
 from more2_jax.tracking.objects import accumulated
+from more2_jax.tracking.room_points import remembered
 from more2_jax.tracking.split_masks import reach_m
 from more2_jax.types import Observation, Repair, SceneObject
 
@@ -36,7 +37,6 @@ TOUCHING = 2.0  # times the spacing of its points: what lies so near a cloud goe
 GOES_ON = (
     0.3  # as many points must touch the neighbor's own, as a share of those that touch the rest of the mask
 )
-THINNED = 20_000  # points of a background, at even steps, that floor and walls are sought in
 TOGETHER = 32  # masks whose surroundings are put in order at once
 BESIDE_M = 0.15  # of what may come back: points that tell how it faces
 
@@ -201,7 +201,7 @@ def regained(views: Sequence[View], loose: Points, background: Points) -> list[B
 
     `loose`: all points of the scan that are no object's. Floor and walls, sought in the `background`, stay there.
     """
-    few = background[:: max(1, -(-len(background) // THINNED))]
+    few = remembered(background)
     surfaces, near = NearPoints(few), NearPoints(loose)  # of a building little lies about one object
     nearest, owner = np.full(len(loose), np.inf), np.full(len(loose), -1)
     for n, (v, room) in enumerate(zip(views, rooms_about(views, few), strict=True)):

@@ -70,8 +70,9 @@ def test_clouds_near_some_places_show_there_what_all_clouds_show():
             here, expected = (x.points_of(x.cells_around(place, 8.0)) for x in (some, whole))
             assert len(here) == len(expected) and missed(expected, here) == set()
         everything = some.around_box(np.full(3, -1e3), np.full(3, 1e3))
-        assert len(rest) <= len(everything) < 60 * 50 + len(rest)
+        assert len(everything) < 60 * 50 + len(rest) / 10
     assert building.near(places, 8.0) is some
+    assert len(building.near([], 8.0).around_box(np.full(3, -1e3), np.full(3, 1e3))) < len(rest) / 10
 
 
 def test_the_radius_of_a_cloud_is_that_of_a_ball_whose_surface_it_covers_wherever_it_lies():

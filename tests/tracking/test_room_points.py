@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from more2_jax.geometry.poses import apply_pose
 from more2_jax.tracking.objects import new_object
-from more2_jax.tracking.room_points import without_room
+from more2_jax.tracking.room_points import BACKGROUND_POINTS, POINTS_A_CELL, remembered, without_room
 from more2_jax.types import Instance, Repair
 
 CHAIR, ROOM = chair(), corner()
@@ -33,6 +33,28 @@ def rows_left(points, background, T=None):
     (left,) = without_room([mask(apply_pose(T, points))], apply_pose(T, background), FEWEST).instances
     kept = set(map(bytes, left.points))
     return np.array([bytes(p) in kept for p in apply_pose(T, points)])
+
+
+def floors(rooms, points, seed=0):
+    """The floors of rooms side by side, 6 by 6 m each."""
+    some = np.random.default_rng(seed).uniform(0, 6, (rooms * points, 3)) * [1, 1, 0] + [0, 0, 0.5]
+    return some + np.repeat(np.arange(rooms), points)[:, None] * [10.0, 0, 0]
+
+
+@pytest.mark.parametrize("points", [0, 1, BACKGROUND_POINTS])
+def test_a_small_background_is_remembered_as_it_is(points):
+    np.testing.assert_array_equal(remembered(floors(1, points)), floors(1, points))
+
+
+def test_of_a_building_so_many_points_a_room_are_remembered_however_many_rooms_there_are():
+    """A floor of 36 cells; 100 of them are a building, of which no room has fewer points than it may have."""
+    one = remembered(floors(1, 70_000))
+    assert BACKGROUND_POINTS / 2 < len(one) <= BACKGROUND_POINTS
+    building = remembered(floors(100, 7_000))
+    room = (building[:, 0] // 10).astype(int)
+    counts = np.bincount(room, minlength=100)
+    most = POINTS_A_CELL * 36
+    assert most / 2 < counts.min() and counts.max() < 1.1 * most and counts.sum() <= 100 * most
 
 
 def test_a_clean_mask_loses_nothing():
