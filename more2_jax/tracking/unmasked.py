@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Bool
 from scipy.spatial import KDTree
 
+from more2_jax.config import MotionModel
 from more2_jax.geometry.near_points import rms_radius
 from more2_jax.geometry.poses import Points, apply_pose
 from more2_jax.geometry.segmentation import segment_geometric
@@ -39,6 +40,7 @@ SAME_M = 1e-6  # nearer points are one
 MOST_COMMON = 0.2  # share of its points that a cloud may have in common with another one
 # Log odds beyond an even chance that are asked of small things, which look alike and of which rooms hold many,
 SMALL = 2.5
+TURNED = 0.5  # in any orientation, in which more clusters fit something,
 REST = 1.0  # and of what may be the rest of an object whose mask is cut:
 REST_M = 0.12  # so near a mask lies
 LEAST_REST = 0.05  # such a share of its points
@@ -164,7 +166,9 @@ def explained(
     found, taken = list[Explained](), np.zeros((0, 3))
     for (row, n), value in sorted(odds.items(), key=lambda x: -x[1]):
         points = parts[n].points
-        if value < compared.even_odds + doubt(parts[n], missing[row]) or row in [e.row for e in found]:
+        if value < compared.even_odds + doubt(parts[n], missing[row], compared.config.motion) or row in [
+            e.row for e in found
+        ]:
             continue
         common = np.isfinite(KDTree(taken).query(points, distance_upper_bound=SAME_M)[0]).mean()
         if common <= MOST_COMMON:
@@ -173,10 +177,11 @@ def explained(
     return found
 
 
-def doubt(thing: Thing, missing: ObservedObject) -> float:
+def doubt(thing: Thing, missing: ObservedObject, motion: MotionModel) -> float:
     """Log odds beyond an even chance that a thing needs to be what is missing."""
     longest = max(np.ptp(p, axis=0).max() for p in (thing.points, missing.points))
-    return SMALL * float(portable(np.array([longest]))[0]) + REST * thing.rest
+    small = SMALL * float(portable(np.array([longest]))[0])
+    return small + REST * thing.rest + TURNED * (motion == "free")
 
 
 def parts_like(

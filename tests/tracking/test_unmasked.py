@@ -6,15 +6,18 @@ import dataclasses
 
 import numpy as np
 import pytest
+from factories import embedding
 from furnished import sheet
 from small_scenes import CONFIG, piece, scan
 
+from more2_jax.config import preset
 from more2_jax.scene import add_scan, start_scene
 from more2_jax.tracking import unmasked
+from more2_jax.tracking.comparison import Comparison
 from more2_jax.tracking.objects import points_of
 from more2_jax.tracking.room_points import remembered
-from more2_jax.tracking.unmasked import things
-from more2_jax.types import Scan
+from more2_jax.tracking.unmasked import REST, SMALL, TURNED, Thing, explained, things
+from more2_jax.types import ObservedObject, Scan
 
 pytestmark = pytest.mark.optimized  # scenes run for longer than their programs compile
 
@@ -117,3 +120,34 @@ def test_of_a_large_background_some_points_are_looked_at(monkeypatch):
     assert sum(len(t.points) for t in things(s.background, masks)) > 0.9 * whole
     monkeypatch.setattr(unmasked, "MOST_POINTS", len(s.background) - 1)
     assert 0.3 * whole < sum(len(t.points) for t in things(s.background, masks)) <= 0.5 * whole
+
+
+def comparison(upright: bool) -> Comparison:
+    """One of nothing, which knows its settings."""
+    config, compared = preset("robust", upright=upright), object.__new__(Comparison)
+    for name, value in {"config": config, "matcher": config.matching, "prior": None}.items():
+        object.__setattr__(compared, name, value)
+    return compared
+
+
+@pytest.mark.parametrize(
+    ("upright", "size_m", "rest", "asked"),
+    [
+        (True, 2.0, False, 0.0),
+        (False, 2.0, False, TURNED),
+        (False, 2.0, True, TURNED + REST),
+        (True, 0.2, False, SMALL),
+    ],
+)
+def test_more_is_asked_in_any_orientation_of_rests_and_of_small_things(
+    monkeypatch, upright, size_m, rest, asked
+):
+    compared = comparison(upright)
+    cube = size_m * np.random.default_rng(0).uniform(size=(300, 3))
+    cloud = ObservedObject(points=cube, embedding=embedding(np.random.default_rng(1), np.zeros(3)))
+    monkeypatch.setattr(unmasked, "parts_like", lambda *_, **__: [Thing(points=cube, rest=rest)])
+    monkeypatch.setattr(unmasked, "observed", lambda *_: [cloud])
+    for more, found in ((-0.05, 0), (0.05, 1)):
+        odds = {(0, 0): compared.even_odds + asked + more}
+        monkeypatch.setattr(unmasked, "odds_with", lambda *_, odds=odds: odds)
+        assert len(explained(compared, [cloud], [], instances=True)) == found
