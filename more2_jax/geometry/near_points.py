@@ -27,8 +27,11 @@ class NearPoints:
         for side, x in zip(SIDES, points.T, strict=True):  # one axis at a time: large scans
             number += side * np.floor(x / CELL_M).astype(np.int64)
         order = np.argsort(number, kind="stable")
-        _, first = np.unique(number[order], return_index=True)
-        self._order, self._points = order.astype(np.int32), points[order]  # all that is kept of a large scan
+        number = number[order]
+        first = np.flatnonzero(np.append(True, number[1:] != number[:-1])[: len(points)])
+        del number  # of a building 130 MB, while its points are held twice
+        order = order.astype(np.int32)
+        self._order, self._points = order, points[order]  # all that is kept of a large scan
         self._ends = np.append(first, len(points))
         self._center = (np.floor(self._points[first] / CELL_M) + 0.5) * CELL_M
         self._tree = KDTree(self._center) if len(first) else None
