@@ -61,7 +61,7 @@ class Cleared:
 def remembered(background: Points) -> Points:
     """Returns every k-th point of a scan's background: `BACKGROUND_POINTS` at most, of a building more.
 
-    A room has some 150 cells of a meter that hold surfaces: floors and walls of every room are as dense as of one.
+    Rooms have 40 to 140 cells of a meter that hold surfaces: those of a building are about as dense as one alone.
     """
     if len(background) <= BACKGROUND_POINTS:
         return background

@@ -166,9 +166,8 @@ def explained(
     found, taken = list[Explained](), np.zeros((0, 3))
     for (row, n), value in sorted(odds.items(), key=lambda x: -x[1]):
         points = parts[n].points
-        if value < compared.even_odds + doubt(parts[n], missing[row], compared.config.motion) or row in [
-            e.row for e in found
-        ]:
+        asked = compared.even_odds + doubt(parts[n], missing[row], compared.config.motion)
+        if value < asked or row in [e.row for e in found]:
             continue
         common = np.isfinite(KDTree(taken).query(points, distance_upper_bound=SAME_M)[0]).mean()
         if common <= MOST_COMMON:

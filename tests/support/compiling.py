@@ -19,7 +19,8 @@ def compile_quickly() -> None:
     Such programs compile several times faster, run slower, and compute the same up to rounding. Processes that tests
     start compile as they do for users.
     """
-    os.environ["XLA_FLAGS"] = FLAGS
+    if FLAGS:
+        os.environ["XLA_FLAGS"] = FLAGS
     jax.config.update(LITTLE, True)
     jax.config.update(PRECISION, "highest")
 
