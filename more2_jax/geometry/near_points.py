@@ -95,7 +95,7 @@ class NearClouds:
     def __init__(self, clouds: Sequence[Made], rest: Points) -> None:
         """`rest`: points of no cloud, such as the background."""
         balls = [ball_around(cloud()) for cloud in clouds]
-        self._clouds, self._rest = clouds, NearPoints(rest)
+        self._clouds, self.rest = clouds, NearPoints(rest)
         self._center = np.reshape([center for center, _ in balls], (-1, 3))
         self._radius = np.array([radius for _, radius in balls])
         self._last: tuple[tuple[list[int], list[int]], NearPoints] | None = None
@@ -107,10 +107,10 @@ class NearClouds:
         for place in places:
             near |= np.linalg.norm(self._center - place, axis=1) <= reach + self._radius
         low, high = (np.reshape(f(places, axis=0), 3) if places else np.zeros(3) for f in (np.min, np.max))
-        key = np.flatnonzero(near).tolist(), self._rest.cells_of_box(low - reach, high + reach)
+        key = np.flatnonzero(near).tolist(), self.rest.cells_of_box(low - reach, high + reach)
         if self._last is None or self._last[0] != key:
             self._last = None  # let go before the next one is made
-            rest = self._rest.around_box(low - reach, high + reach)
+            rest = self.rest.around_box(low - reach, high + reach)
             self._last = key, NearPoints(np.concatenate([*(self._clouds[k]() for k in key[0]), rest]))
         return self._last[1]
 

@@ -11,7 +11,7 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from more2_jax.config import EvidenceMatcher, MotionModel
 from more2_jax.geometry.poses import Points, Pose, apply_pose
@@ -50,8 +50,11 @@ class Proposed:
 
     def among(self, pairs: Collection[tuple[int, int]]) -> Proposed:
         """Those of the pairs that are among some, in their order."""
-        kept = np.array([(k, i) in pairs for k, i in self.pairs.tolist()], bool)
-        return Proposed(pairs=self.pairs[kept], likeness=self.likeness[kept], rank=self.rank[kept])
+        return self.rows(np.array([(k, i) in pairs for k, i in self.pairs.tolist()], bool))
+
+    def rows(self, at: slice | Bool[np.ndarray, " p"]) -> Proposed:
+        """Some of the pairs, in their order."""
+        return Proposed(pairs=self.pairs[at], likeness=self.likeness[at], rank=self.rank[at])
 
 
 def signatures(
@@ -61,13 +64,21 @@ def signatures(
 
     `place`: how the scan lies in the frame that both share; by default as given.
     """
-    inv = np.stack([np.asarray(o.embedding.inv, np.float64) for o in side])
-    center = np.stack([o.points.mean(axis=0) for o in side])
+    each = [
+        (
+            np.asarray(o.embedding.inv, np.float64),
+            float(o.embedding.scale),
+            o.points.mean(axis=0),
+            None if motion is None else extent_of(o.points, motion),
+        )
+        for o in side  # once: halves of masks are made when they are asked for
+    ]
+    inv, scale, center, extent = (np.array(part) for part in zip(*each, strict=True))
     return Signatures(
         inv=inv / np.maximum(np.linalg.norm(inv, axis=1, keepdims=True), 1e-30),
-        scale=np.array([float(o.embedding.scale) for o in side]),
+        scale=scale,
         center=center if place is None else apply_pose(place, center),
-        extent=None if motion is None else np.stack([extent_of(o.points, motion) for o in side]),
+        extent=None if motion is None else extent,
     )
 
 

@@ -55,7 +55,7 @@ def read_points(
     normals = None
     if all(axis in cloud.properties for axis in NORMAL):
         normals = np.stack([np.asarray(cloud.properties[axis], np.float64) for axis in NORMAL], axis=-1)
-    return cloud.points, cloud.properties["scan"].astype(np.int64), normals
+    return cloud.points, cloud.properties["scan"].astype(np.int32), normals
 
 
 def write_mesh(path: Path, mesh: Mesh) -> None:

@@ -270,7 +270,7 @@ def _scene(folder: Path, content: dict[str, Any]) -> LivingScene:
 
 def _background(path: Path) -> tuple[np.ndarray, np.ndarray]:
     """The background's points and their scans; none where the scene has no such file."""
-    return read_points(path)[:2] if path.is_file() else (np.zeros((0, 3)), np.zeros(0, np.int64))
+    return read_points(path)[:2] if path.is_file() else (np.zeros((0, 3)), np.zeros(0, np.int32))
 
 
 def _stacked(embeddings: list[Embedding]) -> dict[str, np.ndarray]:

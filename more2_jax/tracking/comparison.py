@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -21,6 +21,7 @@ from more2_jax.tracking.identify import Identified
 from more2_jax.types import ObservedObject
 
 CANDIDATES = 3  # partners of every cloud that are aligned
+PAIRS_AT_ONCE = 256  # that are held as they were aligned: of a building there are many
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,8 +98,8 @@ class Comparison:
 
     def odds_of_others(
         self,
-        old: Iterable[ObservedObject],
-        new: Iterable[ObservedObject],
+        old: Sequence[ObservedObject],
+        new: Sequence[ObservedObject],
         among: Collection[tuple[int, int]] | None = None,
         *,
         halves: bool = False,
@@ -107,14 +108,19 @@ class Comparison:
 
         `among`: the pairs to ask about, all by default. Halves are small without being what people carry about.
         """
-        old, new = list(old), list(new)
         worth = self.proposed_others(old, new)
         worth = worth if among is None else worth.among(among)
-        if not len(worth.pairs):
-            return {}
+        found = dict[tuple[int, int], float]()
+        for start in range(0, len(worth.pairs), PAIRS_AT_ONCE):
+            found |= self._odds_of_some(old, new, worth.rows(slice(start, start + PAIRS_AT_ONCE)), halves)
+        return found
+
+    def _odds_of_some(
+        self, old: Sequence[ObservedObject], new: Sequence[ObservedObject], worth: Proposed, halves: bool
+    ) -> dict[tuple[int, int], float]:
         # What is part of no pair is not prepared.
         rows, at = zip(*(np.unique(side, return_inverse=True) for side in worth.pairs.T), strict=True)
-        clouds = [old[k] for k in rows[0]], [new[i] for i in rows[1]]
+        clouds = [old[k] for k in rows[0].tolist()], [new[i] for i in rows[1].tolist()]
         aligned = self.align_others(clouds, dataclasses.replace(worth, pairs=np.stack(at, axis=1)))
         if halves:
             known = dataclasses.replace(aligned.compared, portable=np.zeros(len(aligned.rows)))
@@ -123,10 +129,10 @@ class Comparison:
         return {(k, i): z for (k, i), z in zip(worth.pairs.tolist(), odds.value.tolist(), strict=True)}
 
     def poses_of_others(
-        self, old: Iterable[ObservedObject], new: Iterable[ObservedObject]
+        self, old: Sequence[ObservedObject], new: Sequence[ObservedObject]
     ) -> dict[tuple[int, int], tuple[float, Pose]]:
         """As `odds_of_others`, with the pose that fits best: T_old_new."""
-        clouds, search, motion = (list(old), list(new)), self.matcher.search, self.config.motion
+        clouds, search, motion = (old, new), self.matcher.search, self.config.motion
         aligned = self.align_others(clouds, self.proposed_others(*clouds))
         odds = odds_of(aligned, search, motion, self.height_m())
         best = evidence_at(aligned, search, motion, self.height_m()).pose

@@ -8,7 +8,6 @@ they show it on another object. What is no object comes back if they show the ob
 from __future__ import annotations
 
 import dataclasses
-import itertools
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -17,12 +16,12 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.spatial import KDTree
 
-from more2_jax.freed_memory import give_back
-from more2_jax.geometry.near_points import NearClouds, NearPoints, ball_around
+from more2_jax.geometry.near_points import NearClouds, NearPoints
 from more2_jax.geometry.poses import Points, apply_pose
-from more2_jax.geometry.room_planes import AROUND_M, BOX_SLACK, on_planes, room_planes, within
+from more2_jax.geometry.room_planes import AROUND_M, on_planes, room_planes, within
 from more2_jax.tracking.objects import accumulated
 from more2_jax.tracking.room_points import remembered
+from more2_jax.tracking.scan_nearby import shown_near
 from more2_jax.tracking.split_masks import reach_m
 from more2_jax.types import Observation, Repair, SceneObject
 
@@ -37,7 +36,6 @@ TOUCHING = 2.0  # times the spacing of its points: what lies so near a cloud goe
 GOES_ON = (
     0.3  # as many points must touch the neighbor's own, as a share of those that touch the rest of the mask
 )
-TOGETHER = 32  # masks whose surroundings are put in order at once
 BESIDE_M = 0.15  # of what may come back: points that tell how it faces
 
 
@@ -69,6 +67,11 @@ class View:
         """What the other scans show that make up its shape."""
         shape = np.isin(self.object.point_scan, [s.scan for s in accumulated(self.object)])
         return self._there(shape & (self.object.point_scan != self.scan))
+
+    @property
+    def whole(self) -> Points:
+        """What that scan and the others show."""
+        return np.concatenate([self.own, self.others])
 
     def _there(self, rows: Rows) -> Points:
         return apply_pose(np.linalg.inv(self.seen.T_ref_scan), self.object.points[rows])
@@ -201,17 +204,18 @@ def regained(views: Sequence[View], loose: Points, background: Points) -> list[B
 
     `loose`: all points of the scan that are no object's. Floor and walls, sought in the `background`, stay there.
     """
-    few = remembered(background)
-    surfaces, near = NearPoints(few), NearPoints(loose)  # of a building little lies about one object
+    scan = NearClouds([partial(getattr, v, "own") for v in views], remembered(background))
+    near = NearPoints(loose)  # of a building little lies about one object
+    rooms = shown_near([partial(getattr, v, "whole") for v in views], scan, AROUND_M)
     nearest, owner = np.full(len(loose), np.inf), np.full(len(loose), -1)
-    for n, (v, room) in enumerate(zip(views, rooms_about(views, few), strict=True)):
+    for n, (v, room) in enumerate(zip(views, rooms, strict=True)):
         own, others = v.own, v.others
         rows = near.rows_around_box(others.min(axis=0) - v.reach_m, others.max(axis=0) + v.reach_m)
         distance = off(loose[rows], others, v.reach_m)
         closer = distance < nearest[rows]
         rows, distance = rows[closer], distance[closer]
         among = np.concatenate([own, within(KDTree(others), near, v.reach_m + BESIDE_M)])
-        planes = room_planes(np.concatenate([own, others]), surfaces, room) if len(rows) else []
+        planes = room_planes(v.whole, scan.rest, room) if len(rows) else []
         free = ~on_planes(loose[rows], planes, among)[0]
         nearest[rows[free]], owner[rows[free]] = distance[free], n
     return [
@@ -224,16 +228,6 @@ def regained(views: Sequence[View], loose: Points, background: Points) -> list[B
         for n, v in enumerate(views)
         if (rows := owner == n).sum() >= LEAST_CHANGED * v.count
     ]
-
-
-def rooms_about(views: Sequence[View], background: Points) -> Iterator[NearPoints]:
-    """For every view what its scan shows around: all masks near it and near those next in line, and the background."""
-    clouds = NearClouds([partial(getattr, v, "own") for v in views], background)
-    for start in range(0, len(views), TOGETHER):
-        give_back(len(views))
-        balls = [ball_around(np.concatenate([v.own, v.others])) for v in views[start : start + TOGETHER]]
-        reach_m = max(radius for _, radius in balls) + 2 * BOX_SLACK * AROUND_M
-        yield from itertools.repeat(clouds.near([center for center, _ in balls], reach_m), len(balls))
 
 
 def off(points: Points, cloud: Points, reach_m: float) -> Distances:
@@ -265,7 +259,7 @@ def with_borders(objects: Sequence[SceneObject], borders: Sequence[Border]) -> l
             o,
             points=np.concatenate([o.points[kept], *points]),
             point_scan=np.concatenate(
-                [o.point_scan[kept], *(np.full(len(b.points), b.view.scan) for b in more)]
+                [o.point_scan[kept], *(np.full(len(b.points), b.view.scan, np.int32) for b in more)]
             ),
             normals=normals,
             mesh=None,

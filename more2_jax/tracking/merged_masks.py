@@ -7,8 +7,9 @@ be, proposes how a mask may fall in two; surfaces decide, as they decide who is 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import overload
 
 import numpy as np
 from jaxtyping import Float
@@ -18,14 +19,14 @@ from more2_jax.geometry.normalized_cut import Cut, Rows, thinnest_cuts
 from more2_jax.geometry.poses import Points, Pose, apply_pose
 from more2_jax.geometry.transform import transform
 from more2_jax.matching.color import color_of
-from more2_jax.network.embedding_batch import embed
+from more2_jax.network.embedding_batch import PADDED_TOGETHER, embed
 from more2_jax.tracking.comparison import Comparison
 from more2_jax.tracking.divisions import LEAST_GAIN, Division, Part, Wholes, chosen
 from more2_jax.tracking.objects import place_of
 from more2_jax.tracking.regrouped import Regrouped
 from more2_jax.tracking.room_points import some_points
 from more2_jax.tracking.split_masks import reach_m
-from more2_jax.types import Instance, ObservedObject, Repair, SceneObject
+from more2_jax.types import Embedding, Instance, ObservedObject, Repair, SceneObject
 
 Normals = Float[np.ndarray, "n 3"]
 
@@ -58,6 +59,27 @@ class Standing:
         near = [self.clouds[k] for k in rows.tolist() if k != but]
         tree = KDTree(points) if near else None
         return [c for c in near if tree is not None and share_near(tree, c) >= LEAST_COMMON]
+
+
+class Halves(Sequence[ObservedObject]):
+    """Parts of clouds as they are compared, made when they are asked for: few are worth aligning."""
+
+    def __init__(self, made: Callable[[Part], ObservedObject], parts: Sequence[Part]) -> None:
+        self._made, self._parts = made, parts
+
+    def __len__(self) -> int:
+        return len(self._parts)
+
+    @overload
+    def __getitem__(self, row: int) -> ObservedObject: ...
+
+    @overload
+    def __getitem__(self, row: slice) -> Halves: ...
+
+    def __getitem__(self, row: int | slice) -> ObservedObject | Halves:
+        if isinstance(row, slice):
+            return Halves(self._made, self._parts[row])
+        return self._made(self._parts[row])
 
 
 def lowest(points: Points) -> Float[np.ndarray, "3"]:
@@ -146,7 +168,7 @@ def divisions_of_instances(
         halves_of(compared, cuts, [(i.points, i.normals) for i in instances]),
         wholes,
         lambda parts, others, among: compared.odds_of_others(
-            [compared.old[k] for k in others], map(half, parts), among, halves=True
+            [compared.old[k] for k in others], Halves(half, parts), among, halves=True
         ),
     )
 
@@ -183,7 +205,10 @@ def divisions_of_objects(
         lambda parts, others, among: {
             (i, part): z
             for (part, i), z in compared.odds_of_others(
-                map(half, parts), [compared.new[i] for i in others], {(p, i) for i, p in among}, halves=True
+                Halves(half, parts),
+                [compared.new[i] for i in others],
+                {(p, i) for i, p in among},
+                halves=True,
             ).items()
         },
     )
@@ -219,8 +244,11 @@ def halves_of(
     ]
     if not every:
         return []
-    normals = [None if n is None else n[rows] for w, rows, _ in every for n in (clouds[w][1],)]
-    codes = embed(compared.prior, [clouds[w][0][rows] for w, rows, _ in every], normals)
+    codes = list[Embedding]()
+    for start in range(0, len(every), PADDED_TOGETHER):
+        some = [(*clouds[w], rows) for w, rows, _ in every[start : start + PADDED_TOGETHER]]
+        normals = [None if n is None else n[rows] for _, n, rows in some]
+        codes += embed(compared.prior, [points[rows] for points, _, rows in some], normals)
     parts = [Part(whole=w, rows=r, embedding=e, narrow=n) for (w, r, n), e in zip(every, codes, strict=True)]
     return list(zip(parts[::2], parts[1::2], strict=True))
 

@@ -9,14 +9,16 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 from jaxtyping import Bool
 from scipy.spatial import KDTree
 
-from more2_jax.geometry.near_points import CELL_M, NearPoints
+from more2_jax.geometry.near_points import CELL_M, NearClouds
 from more2_jax.geometry.poses import Points
-from more2_jax.geometry.room_planes import on_planes, room_planes, within
+from more2_jax.geometry.room_planes import AROUND_M, on_planes, room_planes, within
+from more2_jax.tracking.scan_nearby import shown_near
 from more2_jax.types import Instance, Repair, SceneObject
 
 Rows = Bool[np.ndarray, " n"]
@@ -76,12 +78,12 @@ def without_room(instances: Sequence[Instance], background: Points, fewest: int)
 
     One that would keep fewer than `fewest` points, or lose hardly any or most of them, stays whole.
     """
-    room = NearPoints(np.concatenate([*(i.points for i in instances), background]))
-    walls = NearPoints(background)
+    clouds = [partial(getattr, i, "points") for i in instances]
+    scan = NearClouds(clouds, background)
     cleared, dropped = list[Instance](), dict[int, Dropped]()
-    for i in instances:
-        among = np.concatenate([i.points, within(KDTree(i.points), walls, BESIDE_M)])
-        on, sure = on_planes(i.points, room_planes(i.points, walls, room), among)
+    for i, room in zip(instances, shown_near(clouds, scan, AROUND_M), strict=True):
+        among = np.concatenate([i.points, within(KDTree(i.points), scan.rest, BESIDE_M)])
+        on, sure = on_planes(i.points, room_planes(i.points, scan.rest, room), among)
         if LEAST_DROPPED <= on.mean() <= MOST_DROPPED and (~on).sum() >= fewest:
             dropped[i.id] = Dropped(count=int(on.sum()), points=len(on), sure=float(sure.sum() / on.sum()))
             cleared.append(some_points(i, ~on))
