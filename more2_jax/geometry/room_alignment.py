@@ -39,7 +39,8 @@ YAWS = 4  # turns tried, each with its half turn
 SHIFTS = 3  # for each
 CELL_M = 0.1  # of the maps from above
 ROUGH_VOXELS = 2500  # while many poses are tried
-THREADS = 4  # of a search in a tree: few, as scenes may be worked on side by side
+THREADS = 4  # of a search in a tree, at most: few, as scenes may be worked on side by side
+POINTS_A_THREAD = 2000  # starting one takes as long as a hundred points
 MOST_VOXELS = 8000  # at even steps, of the moving scan
 
 
@@ -63,6 +64,11 @@ class RoomShape:
     tree: KDTree
 
 
+def threads_for(points: Points) -> int:
+    """How many threads search a tree for so many points."""
+    return min(THREADS, 1 + len(points) // POINTS_A_THREAD)
+
+
 def _refined(a: RoomShape, b: RoomShape, T_a_b: Pose, reaches_m: Sequence[float]) -> Pose:
     """The pose after ICP."""
     rows = slice(None, None, max(1, -(-len(b.points) // MOST_VOXELS)))
@@ -78,7 +84,9 @@ def _refined(a: RoomShape, b: RoomShape, T_a_b: Pose, reaches_m: Sequence[float]
 
 def _step(a: RoomShape, points: Points, normals: Points, reach_m: float) -> Pose:
     """The motion that takes the points closer to the tangent planes of what they lie nearest."""
-    distance, near = map(np.asarray, a.tree.query(points, distance_upper_bound=reach_m, workers=THREADS))
+    distance, near = map(
+        np.asarray, a.tree.query(points, distance_upper_bound=reach_m, workers=threads_for(points))
+    )
     near = np.minimum(near, len(a.points) - 1)
     rows = np.isfinite(distance) & (np.abs(np.einsum("ni,ni->n", normals, a.normals[near])) > PARALLEL)
     if rows.sum() < 6:
@@ -178,8 +186,9 @@ def _on_other(a: RoomShape, b: RoomShape, T_a_b: Pose) -> tuple[float, float]:
     """
     normals = _turned(T_a_b, b.normals)
     # Bounded: of a pose that does not fit most lies far off, where a search would be long.
+    there = apply_pose(T_a_b, b.points)
     distance, near = map(
-        np.asarray, a.tree.query(apply_pose(T_a_b, b.points), distance_upper_bound=FITS_M, workers=THREADS)
+        np.asarray, a.tree.query(there, distance_upper_bound=FITS_M, workers=threads_for(there))
     )
     near = np.minimum(near, len(a.points) - 1)
     parallel = np.abs(np.einsum("ni,ni->n", normals, a.normals[near])) > PARALLEL

@@ -15,7 +15,7 @@ from scipy.spatial import KDTree
 
 from more2_jax.geometry.near_points import NearPoints
 from more2_jax.geometry.poses import Points
-from more2_jax.geometry.room_alignment import THREADS
+from more2_jax.geometry.room_alignment import threads_for
 
 # Chosen on rooms of regime `real`, docs/developing/notebook/mask_repair.md.
 AROUND_M = 0.75  # of the cloud: what is looked at
@@ -117,7 +117,9 @@ def is_wide(points: Points) -> bool:
 
 def goes_on(plane: RoomPlane, tree: KDTree) -> bool:
     """Whether a plane goes on where the cloud ends; the rest of a tabletop that was cut off does not."""
-    near = np.isfinite(tree.query(plane.points, distance_upper_bound=BEYOND_M, workers=THREADS)[0])
+    near = np.isfinite(
+        tree.query(plane.points, distance_upper_bound=BEYOND_M, workers=threads_for(plane.points))[0]
+    )
     return float((~near).mean()) >= LEAST_BEYOND
 
 
@@ -137,7 +139,9 @@ def within(tree: KDTree, points: Points | NearPoints, reach_m: float) -> Points:
         points = points.around_box(low, high)
     for axis in range(3):
         points = points[(points[:, axis] >= low[axis]) & (points[:, axis] <= high[axis])]
-    return points[np.isfinite(tree.query(points, distance_upper_bound=reach_m, workers=THREADS)[0])]
+    return points[
+        np.isfinite(tree.query(points, distance_upper_bound=reach_m, workers=threads_for(points))[0])
+    ]
 
 
 def on_planes(
@@ -158,8 +162,7 @@ def on_planes(
 
 def across(points: Points, among: Points) -> Points:
     """Unit normals, of either sign, of the surface that a cloud has at some points, by their nearest neighbors."""
-    near = (
-        KDTree(among).query(points, k=min(NEIGHBORS, len(among)), workers=THREADS)[1].reshape(len(points), -1)
-    )
+    count = min(NEIGHBORS, len(among))
+    near = KDTree(among).query(points, k=count, workers=threads_for(points))[1].reshape(len(points), -1)
     centered = among[near] - among[near].mean(axis=1, keepdims=True)
     return np.linalg.eigh(np.einsum("nki,nkj->nij", centered, centered))[1][:, :, 0]
