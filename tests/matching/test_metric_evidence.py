@@ -208,3 +208,16 @@ def test_clouds_that_are_compared_later_are_compared_among_the_same_noise(tiny_p
         odds.append(compared.odds_of_others(old, new))
     assert odds[0] == odds[1] and odds[0].keys() == odds[2].keys()
     assert all(odds[2][pair] > odds[0][pair] for pair in [(0, 0), (1, 1)])
+
+
+def test_pairs_are_weighed_alike_however_many_are_held_at_once(tiny_prior, scans, monkeypatch):
+    old, new = scans
+    config = dataclasses.replace(preset("robust", upright=True), matching=EvidenceMatcher(search=SEARCH))
+    pairs = align_candidates(tiny_prior, old, new, config.matching, "upright")
+    compared = Comparison.of(tiny_prior, old, new, Identified(aligned=pairs), config)
+    assert compared is not None
+    together = compared.odds_of_others(old, new)
+    monkeypatch.setattr("more2_jax.tracking.comparison.PAIRS_AT_ONCE", 1)
+    apart = compared.odds_of_others(old, new)
+    assert len(together) > 2 and list(apart) == list(together)
+    np.testing.assert_allclose(list(apart.values()), list(together.values()), atol=1e-4)

@@ -7,7 +7,7 @@ from factories import turn_z
 
 from more2_jax.geometry.poses import apply_pose
 from more2_jax.tracking.divisions import LEAST_GAIN, Division, Part, Wholes, chosen, compatible
-from more2_jax.tracking.merged_masks import Standing, beside_of, larger_first
+from more2_jax.tracking.merged_masks import Halves, Standing, beside_of, larger_first
 from more2_jax.types import Embedding, ObservedObject
 
 
@@ -195,3 +195,18 @@ def test_once_more_in_any_orientation_both_halves_must_be_known():
     for again in (False, True):
         assert bool(decided(one, narrow=True, motion="free", both_known=again)) is not again
         assert decided(both, narrow=True, motion="free", both_known=again)
+
+
+def test_halves_are_made_when_they_are_asked_for_and_not_kept():
+    made = list[int]()
+
+    def cloud(part: Part) -> ObservedObject:
+        made.append(part.whole)
+        return ObservedObject(points=np.zeros((part.whole, 3)), embedding=CODE)
+
+    parts = [Part(whole=n, rows=np.ones(n, bool), embedding=CODE, narrow=False) for n in (3, 4, 5)]
+    halves = Halves(cloud, parts)
+    assert len(halves) == 3 and not made
+    assert len(halves[1].points) == 4 and made == [4]
+    assert [len(h.points) for h in halves[1:]] == [4, 5] and made == [4, 4, 5]
+    assert [len(h.points) for h in halves] == [3, 4, 5]
