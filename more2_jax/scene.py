@@ -42,9 +42,9 @@ from more2_jax.tracking.objects import SCENE_FRAME, accumulated, new_objects, ne
 from more2_jax.tracking.regrouped import Regrouped, as_sure_as_masks
 from more2_jax.tracking.relocalize import accumulated_rows, known_object, relocalize, with_observations
 from more2_jax.tracking.room_points import Cleared, remembered, without_room
-from more2_jax.tracking.rooms import rooms_of
+from more2_jax.tracking.rooms import Rooms, rooms_of
 from more2_jax.tracking.scan_record import record
-from more2_jax.tracking.split_masks import mend_splits
+from more2_jax.tracking.split_masks import Mended, mend_splits
 from more2_jax.tracking.surroundings import surroundings, surroundings_of_objects
 from more2_jax.tracking.unmasked import not_sought, without_unfound
 from more2_jax.types import (
@@ -52,6 +52,7 @@ from more2_jax.types import (
     Instance,
     LivingScene,
     Mesh,
+    Observation,
     ObservedObject,
     Repair,
     Scan,
@@ -173,10 +174,10 @@ def added(
     with stage("register", len(found := identified.found)):
         give_back(len(found))  # what matching took
         views = Views(whole.objects, scene.scans, whole.instances, level, remembered(level.background))
-        seen, frame = relocalize(prior, views, old, new, identified, index, config, rooms_of(scene, level))
+        rooms = rooms_of(scene, level)
+        seen, frame = relocalize(prior, views, old, new, identified, index, config, rooms)
     codes, identified, views, old, new = [o.embedding for o in new], identified.without_pairs(), None, (), ()
-    pairs = [(f.object, f.instance) for f in found if config.repair_masks]
-    mended = mend_splits(whole.objects, whole.instances, pairs, seen[: len(pairs)])
+    mended = with_splits_mended(whole, found, seen, rooms, config)
     objects = with_observations(mended.objects, mended.instances, found, seen)
     objects, borders = with_borders_mended(objects, whole.masked(found), scene, level, config)
     if config.accumulate_target:
@@ -346,6 +347,15 @@ def without_floor_and_walls(instances: list[Instance], scan: Scan, config: Scene
     if not config.repair_masks:
         return Cleared(instances=instances)
     return without_room(instances, remembered(scan.background), config.min_points)
+
+
+def with_splits_mended(
+    whole: Regrouped, found: Sequence[Found], seen: Sequence[Observation], rooms: Rooms, config: SceneConfig
+) -> Mended:
+    """Returns objects and instances, leftovers joined to what they are parts of, if masks are repaired."""
+    pairs = [(f.object, f.instance) for f in found if config.repair_masks]
+    shown = rooms.surfaces if pairs and config.upright else None
+    return mend_splits(whole.objects, whole.instances, pairs, seen[: len(pairs)], shown)
 
 
 def with_borders_mended(

@@ -15,13 +15,13 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from more2_jax.geometry.poses import Points, Pose, apply_pose
+from more2_jax.geometry.touching_surfaces import touch
 from more2_jax.tracking.comparison import Comparison
 from more2_jax.tracking.joined_masks import (
     Join,
     instances_together,
     objects_together,
     seen_with,
-    touch,
     with_instances_joined,
     with_objects_joined,
 )

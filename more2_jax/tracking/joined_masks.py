@@ -14,9 +14,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import KDTree
 
 from more2_jax.geometry.poses import Points
+from more2_jax.geometry.touching_surfaces import touch
 from more2_jax.geometry.transform import transform
 from more2_jax.matching.color import color_of
 from more2_jax.network.embedding_batch import embed
@@ -29,9 +29,6 @@ from more2_jax.tracking.split_masks import Balls, absorbed, joined, share_on
 from more2_jax.types import Instance, ObservedObject, Repair, SceneObject
 
 # Chosen on rooms of regimes `paper`, `sparse` and `real`, docs/developing/notebook/mask_parts.md.
-TOUCHING = 2.0  # distances between neighboring points: parts of one surface lie no farther apart
-# Of as many points as a line across the smaller cloud has: so many of both lie that near the other.
-LEAST_TOUCHING = 0.5
 LEAST_ON = 0.3  # share of a part that must lie on the other scan's object, which may be a part itself
 LIKELY = 1.0  # log odds beyond an even chance: what is so likely an object of its own
 LEAST_GAIN = 1.0  # is joined where both together are so much likelier than the likelier of them
@@ -182,23 +179,6 @@ def join_parts(whole: Regrouped, compared: Comparison) -> Regrouped | None:
     if not of_instances and not of_objects:
         return None
     return with_instances_joined(with_objects_joined(whole, of_objects, prior), of_instances, prior)
-
-
-def touch(one: Points, other: Points) -> bool:
-    """Whether two clouds are parts of one surface: along a line, as near one another as their points are."""
-    one, other = np.unique(one, axis=0), np.unique(other, axis=0)  # points given twice lie no nearer
-    if min(len(one), len(other)) < 2:
-        return False  # without a distance between neighbors
-    reach = TOUCHING * spacing_of_two(one, other)
-    near = [KDTree(a).query(b, distance_upper_bound=reach)[0] for a, b in ((one, other), (other, one))]
-    across = min(len(one), len(other)) ** 0.5
-    return sum(int(np.isfinite(d).sum()) for d in near) >= LEAST_TOUCHING * across
-
-
-def spacing_of_two(one: Points, other: Points) -> float:
-    """Median distance between neighboring points of two clouds, meters."""
-    distances = [KDTree(p).query(p, k=2)[0][:, 1] for p in (one, other)]
-    return float(np.median(np.concatenate(distances)))
 
 
 def each_once(found: Sequence[Join]) -> list[Join]:

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 
+from more2_jax.geometry.near_points import NearClouds
 from more2_jax.geometry.poses import Points, apply_pose
 from more2_jax.geometry.room_alignment import (
     CLEARLY,
@@ -43,6 +44,16 @@ class Rooms:
         return (
             shape_of(self.scene, map(last_place, self.objects)),
             shape_of(self.scan, (i.points for i in self.instances)),
+        )
+
+    @cached_property
+    def surfaces(self) -> tuple[NearClouds, NearClouds] | None:
+        """All that either shows, to be asked what lies near a place; None where one shows too little of a room."""
+        if min(len(self.scene), len(self.scan)) < LEAST_BACKGROUND:
+            return None
+        return (
+            NearClouds([partial(last_place, o) for o in self.objects], self.scene),
+            NearClouds([partial(getattr, i, "points") for i in self.instances], self.scan),
         )
 
     @cached_property

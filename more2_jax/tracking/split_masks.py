@@ -9,20 +9,20 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 from scipy.spatial import KDTree
 
-from more2_jax.geometry.near_points import rms_radius
+from more2_jax.geometry.near_points import NearClouds, rms_radius
 from more2_jax.geometry.poses import Points, Pose, apply_pose
 from more2_jax.matching.color import pooled
 from more2_jax.tracking.objects import accumulated_points, all_normals, place_of
+from more2_jax.tracking.partly_shown import coming_along
 from more2_jax.types import Instance, Observation, Repair, SceneObject
 
-Parts = dict[
-    int, tuple[int, float]
-]  # row of a part → which of those found it is part of, share of it on that
+Shown = tuple[NearClouds, NearClouds]  # all that the scene and that a scan show, each in its own frame
 
 # Chosen on rooms of regime `real`, docs/developing/notebook/mask_repair.md.
 NEAR = 0.08  # shares of the object's radius: what lies so near its points lies on it
@@ -30,6 +30,17 @@ NEAR_M = 0.03  # and at least so near: what fusion and drift leave of a surface
 LEAST_ON = 0.6  # share of a part that must lie on the whole
 WORST_MISFIT = 0.5  # of the pose by which parts are laid onto the whole,
 ON_AT_REST = 0.9  # if not so much of the part that was found lies on the whole where nothing moved
+
+
+class Part(NamedTuple):
+    """What a part was found to be part of."""
+
+    whole: int  # row among those found
+    on: float  # share of the part that lies on it
+    sure: float  # that share, or how surely the part came along (`coming_along`)
+
+
+Parts = dict[int, Part]  # by rows of the parts
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,23 +69,27 @@ def mend_splits(
     instances: Sequence[Instance],
     found: Sequence[tuple[int, int]],
     seen: Sequence[Observation],
+    shown: Shown | None = None,
 ) -> Mended:
     """Joins the parts of one object: those in this scan, and those in the scan before.
 
-    `found` names objects and instances by rows, `seen` says where each instance lies on its object.
+    `found` names objects and instances by rows, `seen` says where each instance lies on its object. `shown`: all that
+    the scene (its frame) and the scan show, z up; without it parts must lie on the whole.
     """
     mended, known, repairs = list(instances), list(objects), list[Repair]()
-    now, then = (parts(objects, instances, found, seen) for parts in (parts_in_scan, parts_known))
+    before, after = shown or (None, None)
+    now = parts_in_scan(objects, instances, found, seen, before)
+    then = parts_known(objects, instances, found, seen, after)
     for n, (k, i) in enumerate(found):
-        rows = [row for row, (whole, _) in now.items() if whole == n]
+        rows = [row for row, part in now.items() if part.whole == n]
         if rows:
             mended[i] = joined(instances[i], [instances[row] for row in rows])
             ids = tuple(instances[row].id for row in (i, *rows))
-            share = min(now[row][1] for row in rows)
+            share = min(now[row].sure for row in rows)
             repairs.append(Repair(object=objects[k].id, instances=ids, share=share))
-        for row in (row for row, (whole, _) in then.items() if whole == n):
+        for row in (row for row, part in then.items() if part.whole == n):
             known[k] = absorbed(known[k], objects[row])
-            repairs.append(Repair(object=objects[k].id, absorbed=(objects[row].id,), share=then[row][1]))
+            repairs.append(Repair(object=objects[k].id, absorbed=(objects[row].id,), share=then[row].sure))
     return Mended(
         instances=mended,
         objects=known,
@@ -89,20 +104,23 @@ def parts_in_scan(
     instances: Sequence[Instance],
     found: Sequence[tuple[int, int]],
     seen: Sequence[Observation],
+    before: NearClouds | None = None,
 ) -> Parts:
-    """Instances left over that are parts of objects found by another one."""
+    """Instances left over that are parts of objects found by another one. `before`: what the scene shows."""
     left = sorted(set(range(len(instances))) - {i for _, i in found})
     balls = Balls.around([instances[i].points for i in left])
     parts: Parts = {}
     for n, ((k, own), pose) in enumerate(zip(found, seen, strict=True)):
-        whole = accumulated_points(objects[k])
-        T_ref_scan = laid_by(objects[k], whole, instances[own], pose)
-        if T_ref_scan is None:
-            continue
+        whole, T_scene_ref = accumulated_points(objects[k]), place_of(objects[k].observations[-1])
+        trusted = laid_by(objects[k], whole, instances[own], pose)
+        T_ref_scan = pose.T_ref_scan if trusted is None else trusted
         for i in (left[r] for r in balls.reach(whole, T_ref_scan)):
-            share = share_on(whole, apply_pose(T_ref_scan, instances[i].points))
-            if share >= max(LEAST_ON, parts.get(i, (0, 0.0))[1]):
-                parts[i] = n, share
+            points = instances[i].points
+            on = 0.0 if trusted is None else share_on(whole, apply_pose(T_ref_scan, points))
+            T = T_scene_ref @ T_ref_scan, at_rest(pose)
+            sure = on if on >= LEAST_ON else coming_along(on, instances[own].points, points, *T, before)
+            if sure is not None and (i not in parts or (on, sure) > parts[i][1:]):
+                parts[i] = Part(n, on, sure)
     return parts
 
 
@@ -111,8 +129,9 @@ def parts_known(
     instances: Sequence[Instance],
     found: Sequence[tuple[int, int]],
     seen: Sequence[Observation],
+    after: NearClouds | None = None,
 ) -> Parts:
-    """Objects not found that are parts of one that was, now seen whole.
+    """Objects not found that are parts of one that was, now seen whole. `after`: what the scan shows.
 
     Only those that were seen when the other was, and once: two parts of one mask.
     """
@@ -121,16 +140,24 @@ def parts_known(
     parts: Parts = {}
     for n, ((k, i), pose) in enumerate(zip(found, seen, strict=True)):
         last = objects[k].observations[-1]
-        T_ref_scan = laid_by(objects[k], accumulated_points(objects[k]), instances[i], pose)
-        if T_ref_scan is None:
-            continue
-        whole = apply_pose(place_of(last) @ T_ref_scan, instances[i].points)
+        trusted = laid_by(objects[k], accumulated_points(objects[k]), instances[i], pose)
+        T_scene_scan = place_of(last) @ (pose.T_ref_scan if trusted is None else trusted)
+        whole = apply_pose(T_scene_scan, instances[i].points)
+        own = apply_pose(place_of(last), objects[k].points[objects[k].point_scan == last.scan])
         near = (left[r] for r in balls.reach(whole))
         for q in (q for q in near if [s.scan for s in objects[q].observations] == [last.scan]):
-            share = share_on(whole, there(objects[q]))
-            if share >= max(LEAST_ON, parts.get(q, (0, 0.0))[1]):
-                parts[q] = n, share
+            points, rest = there(objects[q]), at_rest(pose)
+            on = 0.0 if trusted is None else share_on(whole, points)
+            T = np.linalg.inv(T_scene_scan), None if rest is None else np.linalg.inv(rest)
+            sure = on if on >= LEAST_ON else coming_along(on, own, points, *T, after)
+            if sure is not None and (q not in parts or (on, sure) > parts[q][1:]):
+                parts[q] = Part(n, on, sure)
     return parts
+
+
+def at_rest(pose: Observation) -> Pose | None:
+    """T_scene_scan if nothing moved; None where the frame of the scan is not known."""
+    return None if pose.frame.unknown else pose.frame.T_scene_scan
 
 
 def there(o: SceneObject) -> Points:

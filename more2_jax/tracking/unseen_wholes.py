@@ -15,13 +15,11 @@ from scipy.spatial import KDTree
 
 from more2_jax.geometry.poses import Points, apply_pose
 from more2_jax.geometry.room_planes import across
+from more2_jax.geometry.touching_surfaces import TOUCHING, spacing_of_two, touch
 from more2_jax.tracking.comparison import Comparison
 from more2_jax.tracking.joined_masks import (
-    TOUCHING,
     Join,
     each_once,
-    spacing_of_two,
-    touch,
     with_instances_joined,
     with_objects_joined,
 )
