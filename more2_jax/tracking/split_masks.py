@@ -113,6 +113,8 @@ def parts_in_scan(
     for n, ((k, own), pose) in enumerate(zip(found, seen, strict=True)):
         whole, T_scene_ref = accumulated_points(objects[k]), place_of(objects[k].observations[-1])
         trusted = laid_by(objects[k], whole, instances[own], pose)
+        if trusted is None and not pose.converged:
+            continue
         T_ref_scan = pose.T_ref_scan if trusted is None else trusted
         for i in (left[r] for r in balls.reach(whole, T_ref_scan)):
             points = instances[i].points
@@ -141,6 +143,8 @@ def parts_known(
     for n, ((k, i), pose) in enumerate(zip(found, seen, strict=True)):
         last = objects[k].observations[-1]
         trusted = laid_by(objects[k], accumulated_points(objects[k]), instances[i], pose)
+        if trusted is None and not pose.converged:
+            continue
         T_scene_scan = place_of(last) @ (pose.T_ref_scan if trusted is None else trusted)
         whole = apply_pose(T_scene_scan, instances[i].points)
         own = apply_pose(place_of(last), objects[k].points[objects[k].point_scan == last.scan])

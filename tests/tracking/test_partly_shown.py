@@ -46,7 +46,7 @@ def shown_up_to(x):
     return points[points[:, 0] < x]
 
 
-def joined(other, ground, *, later, T=MOVED, part=RIGHT, frame=None, shown=True, misfit=0.3):
+def joined(other, ground, *, later, T=MOVED, part=RIGHT, frame=None, shown=True, misfit=0.3, converged=True):
     """How surely the part is joined; None if it is not.
 
     `other`, `ground`: what one scan shows of the bench, and of the floor. The other scan shows two parts, where `T`
@@ -61,10 +61,15 @@ def joined(other, ground, *, later, T=MOVED, part=RIGHT, frame=None, shown=True,
     scan = NearClouds([lambda: there.points], rest), NearClouds([], floor() + [0, 0, -9.0])
     T_ref_scan = np.linalg.inv(T)
     seen = Observation(
-        scan=1, instance=1, T_ref_scan=T_ref_scan, score=0.9, rms_m=0.01, converged=True, misfit=misfit
+        scan=1,
+        instance=1,
+        T_ref_scan=T_ref_scan,
+        score=0.9,
+        rms_m=0.01,
+        converged=converged,
+        misfit=misfit,
+        frame=frame or Frame(),
     )
-    if frame is not None:
-        seen = Observation(**{**vars(seen), "frame": frame})
     known = [there] if later else here
     objects = [new_object(n, 0, i, CODE) for n, i in enumerate(known)]
     both = (scan if later else scan[::-1]) if shown else None
@@ -99,6 +104,7 @@ def test_a_part_that_is_not_shown_at_all_comes_along_only_with_what_moved(later)
     assert joined(none, floor(), later=later) is None
     assert joined(none, hidden, later=later, T=np.eye(4)) is None
     assert joined(none, hidden, later=later, frame=Frame(unknown=True)) is None
+    assert joined(none, hidden, later=later, converged=False) is None
 
 
 @LATER
