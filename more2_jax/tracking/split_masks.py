@@ -36,7 +36,7 @@ class Part(NamedTuple):
     """What a part was found to be part of."""
 
     whole: int  # row among those found
-    on: float  # share of the part that lies on it
+    on: float  # share of the part that lies on it; 0 where the pose is in doubt
     sure: float  # that share, or how surely the part came along (`coming_along`)
 
 
@@ -85,11 +85,11 @@ def mend_splits(
         if rows:
             mended[i] = joined(instances[i], [instances[row] for row in rows])
             ids = tuple(instances[row].id for row in (i, *rows))
-            share = min(now[row].sure for row in rows)
+            share = min(now[row].on for row in rows)
             repairs.append(Repair(object=objects[k].id, instances=ids, share=share))
         for row in (row for row, part in then.items() if part.whole == n):
             known[k] = absorbed(known[k], objects[row])
-            repairs.append(Repair(object=objects[k].id, absorbed=(objects[row].id,), share=then[row].sure))
+            repairs.append(Repair(object=objects[k].id, absorbed=(objects[row].id,), share=then[row].on))
     return Mended(
         instances=mended,
         objects=known,

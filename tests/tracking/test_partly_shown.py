@@ -47,7 +47,7 @@ def shown_up_to(x):
 
 
 def joined(other, ground, *, later, T=MOVED, part=RIGHT, frame=None, shown=True, misfit=0.3, converged=True):
-    """How surely the part is joined; None if it is not.
+    """Share of the part on the bench, where it is joined; None if it is not.
 
     `other`, `ground`: what one scan shows of the bench, and of the floor. The other scan shows two parts, where `T`
     has them. `later`: whether it is the later one.
@@ -86,8 +86,9 @@ LATER = pytest.mark.parametrize("later", [True, False], ids=["in the later scan"
 def test_a_part_of_which_some_is_shown_comes_along_where_the_rest_is_hidden(later):
     some = shown_up_to(1.15)
     assert SOME_ON < share_on(some, RIGHT) < LEAST_ON
-    sure = joined(some, floor(hidden_from=1.15), later=later)
-    assert sure is not None and sure >= 1 - MOST_EMPTY
+    assert joined(some, floor(hidden_from=1.15), later=later) == pytest.approx(
+        share_on(some, RIGHT), abs=0.02
+    )
     assert joined(some, floor(), later=later) is None  # it was looked for, and is not there
     assert joined(some, floor(hidden_from=1.15), later=later, shown=False) is None
     assert joined(some, floor(hidden_from=1.15), later=later, T=np.eye(4)) is not None
@@ -99,8 +100,8 @@ def test_a_part_that_is_not_shown_at_all_comes_along_only_with_what_moved(later)
     hidden = floor(hidden_from=CUT)
     assert share_on(none, RIGHT) < SOME_ON
     for misfit in (0.3, 0.8):  # of parts of which each shows what the other does not
-        sure = joined(none, hidden, later=later, misfit=misfit)
-        assert sure is not None and sure >= 1 - HARDLY_EMPTY
+        on = joined(none, hidden, later=later, misfit=misfit)
+        assert on is not None and on < SOME_ON
     assert joined(none, floor(), later=later) is None
     assert joined(none, hidden, later=later, T=np.eye(4)) is None
     assert joined(none, hidden, later=later, frame=Frame(unknown=True)) is None
@@ -120,6 +121,20 @@ def test_empty_is_what_was_seen_past():
     assert share_empty(RIGHT - [0, 0, 5.0], scan) == 0  # below all that it shows
     half = np.concatenate([LEFT, LEFT + [0, 0, 1.0]])
     assert share_empty(half, scan) == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize(("on", "most"), [(SOME_ON, MOST_EMPTY), (0.0, HARDLY_EMPTY)])
+def test_it_is_the_surer_the_less_is_seen_to_be_empty(on, most):
+    found = list[tuple[float, float | None]]()
+    for edge in np.arange(CUT, 1.6, 0.05):  # the floor is seen up to there
+        ground = floor()[floor()[:, 0] < edge]
+        scan = NearClouds([], ground)
+        sure = coming_along(on, LEFT, RIGHT, np.eye(4), MOVED, scan)
+        found.append((share_empty(RIGHT, scan), sure))
+    empty = [e for e, _ in found]
+    assert min(empty) < 0.1 and max(empty) > 0.9 and empty == sorted(empty)
+    assert all(sure == (pytest.approx(1 - e) if e <= most else None) for e, sure in found)
+    assert {sure is None for _, sure in found} == {True, False}
 
 
 def test_nothing_is_known_without_what_the_other_scan_shows():
