@@ -38,9 +38,10 @@ def coming_along(
         return None
     there = apply_pose(T_there, part)
     moved = T_rest is not None and off_m(there, apply_pose(T_rest, part)) > MOVED_M
-    most = MOST_EMPTY if on >= SOME_ON else HARDLY_EMPTY if moved else -1.0
-    empty = share_empty(there, other) if most >= 0 else 1.0
-    return 1 - empty if empty <= most else None
+    if on < SOME_ON and not moved:
+        return None
+    empty = share_empty(there, other)
+    return 1 - empty if empty <= (MOST_EMPTY if on >= SOME_ON else HARDLY_EMPTY) else None
 
 
 def off_m(one: Points, other: Points) -> float:
